@@ -1,0 +1,1 @@
+"""wallmirror: turn a wall into a mirror."""

@@ -1,0 +1,142 @@
+"""Reading TOML with checked fields: every fault becomes one sentence with file and field."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from wallmirror.errors import InputError
+
+
+def read_toml(path: Path) -> Fields:
+    """Parse a TOML file into its root `Fields`; InputError names the file if it is absent or malformed."""
+    try:
+        text = path.read_bytes().decode("utf-8")
+    except FileNotFoundError:
+        raise InputError("no such file", file=path) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read as UTF-8 text ({error})", file=path) from None
+    try:
+        return Fields(tomllib.loads(text), file=path)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"is not valid TOML: {error}", file=path) from None
+
+
+class Fields:
+    """One TOML table whose entries are taken by name and type; `finish` refuses what nobody took.
+
+    Parameters
+    ----------
+    table:
+        The parsed table.
+    file, path:
+        Where it stands, for messages: the file, and the dotted name of the table in it.
+    """
+
+    def __init__(self, table: dict[str, Any], *, file: Path, path: str = "") -> None:
+        self._table = table
+        self._taken: set[str] = set()
+        self.file = file
+        self.path = path
+
+    def error(self, name: str, message: str) -> InputError:
+        """An InputError located at one field of this table."""
+        return InputError(message, file=self.file, field=f"{self.path}.{name}" if self.path else name)
+
+    def has(self, name: str) -> bool:
+        """Whether the field is present."""
+        return name in self._table
+
+    def number(
+        self, name: str, default: float | None = None, *, low: float = -math.inf, high: float = math.inf
+    ) -> float:
+        """A finite number in [low, high]; required when there is no default."""
+        return self._as_number(name, self._take(name, default), low, high)
+
+    def integer(self, name: str, default: int | None = None, *, low: int = 0, high: int = 2**31 - 1) -> int:
+        """A whole number in [low, high]; required when there is no default."""
+        value = self._take(name, default)
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise self.error(name, f"is {value!r}; give a whole number")
+        if not low <= value <= high:
+            raise self.error(name, f"is {value}; give a whole number from {low} to {high}")
+        return value
+
+    def numbers(self, name: str, default: Sequence[float] | None = None, *, size: int = 0) -> tuple[float, ...]:
+        """A list of finite numbers, of the given size unless that is 0; required when there is no default."""
+        value = self._take(name, default)
+        if not isinstance(value, (list, tuple)):
+            raise self.error(name, f"is {value!r}; give a list of numbers")
+        if size and len(value) != size:
+            raise self.error(name, f"has {len(value)} entries; give {size}")
+        return tuple(self._as_number(name, entry, -math.inf, math.inf) for entry in value)
+
+    def text(self, name: str, default: str | None = None) -> str:
+        """A string; required when there is no default."""
+        value = self._take(name, default)
+        if not isinstance(value, str):
+            raise self.error(name, f"is {value!r}; give a text in quotes")
+        return value
+
+    def choice(self, name: str, options: Sequence[str], default: str | None = None) -> str:
+        """One of a few strings."""
+        value = self.text(name, default)
+        if value not in options:
+            raise self.error(name, f'is "{value}"; choose {_listed(options)}')
+        return value
+
+    def table(self, name: str, *, required: bool = True) -> Fields:
+        """A sub-table; an absent optional one reads as empty."""
+        value = self._take(name, None if required else {})
+        if not isinstance(value, dict):
+            raise self.error(name, f"is {value!r}; give a table [{name}]")
+        return Fields(value, file=self.file, path=f"{self.path}.{name}" if self.path else name)
+
+    def tables(self, name: str) -> list[Fields]:
+        """A list of tables [[name]]."""
+        value = self._take(name, None)
+        if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
+            raise self.error(name, f"give a list of tables [[{name}]]")
+        return [Fields(entry, file=self.file, path=f"{name}[{i}]") for i, entry in enumerate(value)]
+
+    def rows(self, name: str) -> list[tuple[float, ...]]:
+        """A list of equally long lists of finite numbers."""
+        value = self._take(name, None)
+        if not isinstance(value, list) or not all(isinstance(row, list) for row in value):
+            raise self.error(name, "give a list of lists of numbers")
+        rows = [tuple(self._as_number(name, entry, -math.inf, math.inf) for entry in row) for row in value]
+        if len({len(row) for row in rows}) > 1:
+            raise self.error(name, "has rows of different lengths")
+        return rows
+
+    def finish(self) -> None:
+        """Refuse the fields that nobody took, with the nearest known name."""
+        for name in self._table:
+            if name not in self._taken:
+                near = difflib.get_close_matches(name, self._taken, n=1)
+                hint = f'; did you mean "{near[0]}"?' if near else f"; known here: {', '.join(sorted(self._taken))}"
+                raise self.error(name, f"is not a known field{hint}")
+
+    def _take(self, name: str, default: Any) -> Any:
+        self._taken.add(name)
+        if name in self._table:
+            return self._table[name]
+        if default is None:
+            raise self.error(name, "is missing")
+        return default
+
+    def _as_number(self, name: str, value: Any, low: float, high: float) -> float:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+            raise self.error(name, f"holds {value!r}; give finite numbers")
+        if not low <= value <= high:
+            raise self.error(name, f"is {value:g}; give a number from {low:g} to {high:g}")
+        return float(value)
+
+
+def _listed(options: Sequence[str]) -> str:
+    quoted = [f'"{option}"' for option in options]
+    return quoted[0] if len(quoted) == 1 else f"{', '.join(quoted[:-1])} or {quoted[-1]}"

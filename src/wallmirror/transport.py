@@ -1,0 +1,322 @@
+"""One bounce of light from the card over the wall to the observer: Algorithm 1 and its physical form.
+
+The radiance that view a, pixel j receives is linear in the pattern, L = F V (eq. 4.11), and F is linear in
+the BRDF,
+
+    F[a, j, i] = sum_q  G[a, j, i, q] rho(theta_s[a, j, i, q], theta_o[a, j, i, q]).
+
+`Kernel` holds the right-hand side without rho; the solvers turn it into sparse matrices, `transport_matrix`
+applies it to a known BRDF. The weight G is
+
+- "thesis":   1, what the thesis's code computes (the cosine absorbed in rho', eq. 4.8);
+- "cosine":   cos theta_s, what its Algorithm 1 says (eq. 2.12);
+- "physical": the reflection equation (1.14) integrated over strip and pixel, cos theta_s cos theta_l / r^2 dA.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from wallmirror.brdf import BRDF, AngleSumBRDF, Mirror
+from wallmirror.errors import InputError
+from wallmirror.geometry import (
+    Array,
+    Card,
+    Observer,
+    incident_angles,
+    outgoing_angles,
+    pixel_half_width,
+    pixel_tangents,
+    wall_points,
+)
+
+#: What stands in front of the BRDF; see the module's text.
+Weights = Literal["thesis", "cosine", "physical"]
+
+_MAX_ORDER = 256
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """The transport from M elements to A x N pixels before the BRDF is known.
+
+    Parameters
+    ----------
+    theta_s, theta_o:
+        Angles at the Q quadrature nodes in radians, broadcastable to (A, N, M, Q).
+    weight:
+        G at the nodes, shape (A, N, M, Q); in steradians for "physical".
+    """
+
+    theta_s: Array
+    theta_o: Array
+    weight: Array
+
+    @property
+    def angle_sum(self) -> Array:
+        """u = theta_s + theta_o, shape (A, N, M, Q), in radians."""
+        return np.broadcast_to(self.theta_s + self.theta_o, self.weight.shape)
+
+    def apply(self, brdf: BRDF) -> Array:
+        """F for a BRDF with finite values, shape (A, N, M)."""
+        rho = brdf.of_sum(self.angle_sum) if isinstance(brdf, AngleSumBRDF) else brdf(self.theta_s, self.theta_o)
+        transport: Array = np.sum(self.weight * rho, axis=-1)
+        return transport
+
+
+def build_kernel(
+    observer: Observer,
+    card: Card,
+    *,
+    weights: Weights = "physical",
+    resolution: float = math.pi / 4,
+    tolerance: float = 1e-6,
+) -> Kernel:
+    """The kernel of one bounce, with quadrature orders that resolve a BRDF of the given angular scale.
+
+    Parameters
+    ----------
+    weights:
+        "thesis", "cosine" or "physical"; the first two take elements and pixels as points.
+    resolution:
+        Smallest angular scale of the BRDF (standard deviation of its narrowest lobe) in radians.
+    tolerance:
+        Largest error wanted, relative to a lobe's peak.
+
+    Raises
+    ------
+    InputError
+        If the strips or pixels are so wide against `resolution` that more than 256 nodes would be needed.
+    """
+    if weights not in get_args(Weights):
+        raise InputError(f'is "{weights}"; choose one of {", ".join(get_args(Weights))}', field="transport")
+    points = weights != "physical"
+    half_pixel = 0.0 if points else pixel_half_width(observer)
+    half_strip = 0.0 if points else card.element_width / 2
+    pixel_turn, strip_turn = _extent_in_angle(observer, card, half_pixel, half_strip)
+    along_pixel = quadrature_order(pixel_turn / resolution, tolerance)
+    along_strip = quadrature_order(strip_turn / resolution, tolerance)
+    return _kernel(observer, card, weights, half_pixel, half_strip, along_pixel, along_strip)
+
+
+def transport_matrix(
+    observer: Observer,
+    card: Card,
+    brdf: BRDF,
+    *,
+    weights: Weights = "physical",
+    tolerance: float = 1e-9,
+) -> Array:
+    """F of section 4.1.2 for a known BRDF, shape (A, N, M).
+
+    Parameters
+    ----------
+    weights:
+        "thesis", "cosine" or "physical".
+    tolerance:
+        Quadrature error wanted, relative to the largest entry: the orders double until F moves by less.
+
+    Examples
+    --------
+    >>> from wallmirror.scene import load_scene
+    >>> scene = load_scene("flat_wall_diffuse")
+    >>> transport_matrix(scene.observer, scene.card, scene.wall.brdf).shape
+    (20, 500, 4)
+    """
+    if isinstance(brdf, Mirror):
+        return mirror_matrix(observer, card, brdf, weights=weights)
+    scale = brdf.angular_scale
+    coarse = build_kernel(observer, card, weights=weights, resolution=scale, tolerance=tolerance).apply(brdf)
+    if weights != "physical":
+        return coarse
+    # The rule for Gaussian lobes gives the orders; halving the scale (about twice the nodes) checks them on this BRDF.
+    while scale > brdf.angular_scale / 16:
+        scale /= 2
+        fine = build_kernel(observer, card, weights=weights, resolution=scale, tolerance=tolerance).apply(brdf)
+        if np.max(np.abs(fine - coarse), initial=0.0) <= tolerance * np.max(np.abs(fine), initial=0.0):
+            return fine
+        coarse = fine
+    return coarse
+
+
+def mirror_matrix(observer: Observer, card: Card, mirror: Mirror, *, weights: Weights = "physical") -> Array:
+    """F of a mirror, shape (A, N, M): the share of each pixel in which the mirrored strip is seen, exactly.
+
+    The observer sees the strip as if from its own image behind the wall. With "thesis" and "cosine" weights
+    each element lights the one pixel that its image falls into, with 1 or cos theta_s: a delta has no width.
+    """
+    t = pixel_tangents(observer)
+    x_o = observer.position[0]
+    depth = observer.distance + card.distance
+    view = np.asarray(observer.view_angles)[:, None, None]
+    centres = np.asarray(card.elements_x)
+
+    def image_tangent(x: Array) -> Array:
+        # x = x_o + depth tan(atan t - view): where on the sensor the point x of the card appears.
+        tangent: Array = np.tan(np.arctan((x - x_o) / depth) + view)
+        return tangent
+
+    if weights != "physical" or card.is_points:
+        if weights == "physical":
+            raise InputError(
+                "points in a mirror have no radiance; give the strips a width and a height",
+                field="card.element_width",
+            )
+        pitch = t[1] - t[0] if t.size > 1 else 2 * math.tan(observer.fov / 2)
+        hit = np.abs(t[:, None] - image_tangent(centres)) <= pitch / 2
+        theta_s = incident_angles(centres, card.distance, wall_points(observer)[..., None])
+        factor = np.cos(theta_s) if weights == "cosine" else 1.0
+        return np.where(hit, mirror.reflectance * factor, 0.0)
+
+    half = pixel_half_width(observer)
+    low = np.maximum(t[:, None] - half, image_tangent(centres - card.element_width / 2))
+    high = np.minimum(t[:, None] + half, image_tangent(centres + card.element_width / 2))
+    nodes, node_weights = np.polynomial.legendre.leggauss(4)
+    inside = 0.5 * (low + high)[..., None] + 0.5 * (high - low)[..., None] * nodes
+    # A pixel's rays reach heights up to `half * path` on the card; only those within the strip see it.
+    path = depth / (np.cos(view)[..., None] + inside * np.sin(view)[..., None])
+    seen = np.minimum(1.0, card.element_height / 2 / np.abs(half * path))
+    share = np.where(high > low, (high - low) / (2 * half), 0.0)
+    matrix: Array = mirror.reflectance * share * np.sum(0.5 * node_weights * seen, axis=-1)
+    return matrix
+
+
+def radiance(transport: ArrayLike, source: ArrayLike) -> Array:
+    """Render L_r = F V: (A, N, M) and (M, B) to (A, N, B) (eqs. 4.10 to 4.12)."""
+    return np.asarray(transport, dtype=np.float64) @ np.asarray(source, dtype=np.float64)
+
+
+def brdf_matrices(transport: ArrayLike) -> tuple[Array, ...]:
+    """The A matrices B_a of section 4.1.2, each (N, M); B is `np.hstack` of them."""
+    return tuple(np.asarray(transport, dtype=np.float64))
+
+
+def strip_factor(distance: float, dx: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:
+    """Integral of cos theta_s cos theta_l / r^2 over the height of a strip parallel to the wall, in 1/m.
+
+    Parameters
+    ----------
+    distance:
+        z, distance between card and wall in metres.
+    dx:
+        Offset along x from wall point to strip, in metres.
+    low, high:
+        Ends of the strip above the wall point, in metres.
+
+    Notes
+    -----
+    The integrand is z^2 / (a^2 + h^2)^2 with a^2 = z^2 + dx^2; its antiderivative is
+    z^2 [h / (2 a^2 (a^2 + h^2)) + atan(h / a) / (2 a^3)].
+    """
+    a = np.hypot(distance, np.asarray(dx, dtype=np.float64))
+
+    def antiderivative(h: ArrayLike) -> Array:
+        # In units of a, so that neither tiny nor huge scenes leave the range of float64.
+        h = np.asarray(h, dtype=np.float64) / a
+        return 0.5 * (distance / a) ** 2 / a * (h / (1 + h * h) + np.arctan(h))
+
+    return antiderivative(high) - antiderivative(low)
+
+
+def quadrature_order(width: float, tolerance: float) -> int:
+    """Smallest Gauss-Legendre order that averages exp(-u^2/2) over an interval of `width` to `tolerance`.
+
+    Parameters
+    ----------
+    width:
+        Length of the interval in standard deviations of the lobe; the worst offset of the lobe counts.
+    """
+    if width <= 0:
+        return 1
+    offsets = np.linspace(0.0, width / 2 + 4.0, 33)
+    reference = _lobe_average(width, offsets)
+    for order in range(1, _MAX_ORDER + 1):
+        nodes, weights = np.polynomial.legendre.leggauss(order)
+        values = np.exp(-0.5 * (offsets[:, None] + 0.5 * width * nodes) ** 2) @ (0.5 * weights)
+        if np.max(np.abs(values - reference)) <= tolerance:
+            return order
+    raise InputError(
+        f"a strip or pixel spans {width:.3g} lobe widths of the BRDF, more than {_MAX_ORDER} quadrature nodes resolve "
+        f"to {tolerance:g}; narrow the strips, use more pixels or accept a larger tolerance",
+        field="card.element_width",
+    )
+
+
+def _lobe_average(width: float, offsets: Array) -> Array:
+    """Exact average of exp(-u^2/2) over [offset - width/2, offset + width/2]."""
+    from scipy.special import erf
+
+    ends = (offsets[:, None] + 0.5 * width * np.array([1.0, -1.0])) / math.sqrt(2)
+    if width < 1e-3:  # the difference of two erf would cancel
+        return np.exp(-0.5 * offsets**2) * (1 + (offsets**2 - 1) * width**2 / 24)
+    difference = erf(ends[:, 0]) - erf(ends[:, 1])
+    return np.asarray(math.sqrt(math.pi / 2) * difference / width, dtype=np.float64)
+
+
+def _extent_in_angle(observer: Observer, card: Card, half_pixel: float, half_strip: float) -> tuple[float, float]:
+    """Largest change of u across one pixel and across one strip, in radians."""
+    t = pixel_tangents(observer)
+    ends = wall_points(observer, t[:, None] + half_pixel * np.array([-1.0, 1.0]))[..., None]
+    strips = np.asarray(card.elements_x)
+    u = outgoing_angles(observer, ends) + incident_angles(strips, card.distance, ends)
+    pixel = float(np.abs(u[:, :, 1] - u[:, :, 0]).max())
+    centre = wall_points(observer)[..., None]
+    strip = incident_angles(strips + half_strip, card.distance, centre) - incident_angles(
+        strips - half_strip, card.distance, centre
+    )
+    return pixel, float(strip.max())
+
+
+def _kernel(
+    observer: Observer,
+    card: Card,
+    weights: Weights,
+    half_pixel: float,
+    half_strip: float,
+    along_pixel: int,
+    along_strip: int,
+) -> Kernel:
+    """Nodes q = (across the pixel, across the strip); the height of the pixel is summed into the weight."""
+    pixel_nodes, pixel_weights = np.polynomial.legendre.leggauss(along_pixel)
+    strip_nodes, strip_weights = np.polynomial.legendre.leggauss(along_strip)
+    t = pixel_tangents(observer)[:, None] + half_pixel * pixel_nodes
+    # Axes: (A, N, M, pixel node, strip node).
+    wall_x = wall_points(observer, t)[:, :, None, :, None]
+    source_x = np.asarray(card.elements_x)[:, None, None] + half_strip * strip_nodes
+    theta_s = incident_angles(source_x, card.distance, wall_x)
+    theta_o = outgoing_angles(observer, wall_x)
+    average = 0.5 * pixel_weights[:, None] * (0.5 * strip_weights)
+    if weights == "thesis":
+        weight = np.broadcast_to(average, theta_s.shape)
+    elif weights == "cosine":
+        weight = average * np.cos(theta_s)
+    elif card.is_points:
+        weight = average * np.cos(theta_s) ** 4 / card.distance**2
+    else:
+        heights = _heights_on_wall(observer, t, half_pixel)
+        weight = np.zeros(theta_s.shape)
+        for height, share in heights:
+            z = height[:, :, None, :, None]
+            half = card.element_height / 2
+            weight += share * strip_factor(card.distance, source_x - wall_x, -half - z, half - z)
+        weight *= average * card.element_width
+    shape = (*theta_s.shape[:3], -1)
+    theta_o = np.broadcast_to(theta_o, theta_s.shape)
+    return Kernel(theta_s.reshape(shape), theta_o.reshape(shape), np.ascontiguousarray(weight).reshape(shape))
+
+
+def _heights_on_wall(observer: Observer, t: Array, half_pixel: float) -> list[tuple[Array, float]]:
+    """Heights (A, N, pixel node) at which a pixel's rays meet the wall, with their shares.
+
+    The strip's factor is even and smooth in the height, so three Gauss-Legendre nodes over the pixel's upper
+    half err by less than (pixel height / card distance)^6.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    view = np.asarray(observer.view_angles)[:, None, None]
+    path = observer.distance / (np.cos(view) + t * np.sin(view))
+    return [(half_pixel * 0.5 * (1 + node) * path, 0.5 * weight) for node, weight in zip(nodes, weights, strict=True)]
