@@ -1,0 +1,246 @@
+"""Monte Carlo against analytic: a statistical statement with an effect size and the smallest bias it could see.
+
+The renders come as S seeds, each an unbiased, independent estimate of the same picture, whatever sampler made
+it; the seeds' scatter is the only estimate of noise used. Three kinds of evidence, none sufficient alone:
+
+- per pixel, a t statistic over seeds, turned into a z score; the largest is judged by Sidak's bound, their
+  distribution by Kolmogorov and Smirnov's test (per-tile tests after Jung, Hanika, Dachsbacher, JCGT 9(2), 2020);
+- per named bias (gain, lobe shift, lobe loss), the least-squares amplitude of its template in each seed, whose
+  mean over seeds sees effects far below one pixel's noise;
+- for each such bias the equivalence bound: the smallest amplitude this run would have caught at 99 % power
+  (two one-sided tests: Schuirmann, J. Pharmacokinetics and Biopharmaceutics 15, 1987).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from wallmirror.errors import InputError
+
+Array = NDArray[np.float64]
+
+#: Chance of rejecting a true model, shared by all tests of one comparison.
+SIGNIFICANCE = 1e-3
+_POWER = 0.99
+# Pixels darker than this share of the brightest are starved: too few samples reach them for a t statistic.
+_STARVED = 1e-3
+_TILE = 10
+
+
+@dataclass(frozen=True)
+class BiasTest:
+    """Amplitude of one named bias in units of its template.
+
+    Parameters
+    ----------
+    name, unit:
+        E.g. "gain" in parts of 1, "lobe shift" in degrees.
+    estimate, standard_error, interval:
+        Mean over seeds, its standard error and its 99 % confidence interval.
+    p_value:
+        Of the hypothesis that the amplitude is zero.
+    detectable:
+        Smallest amplitude that this run would have rejected with 99 % power.
+    """
+
+    name: str
+    unit: str
+    estimate: float
+    standard_error: float
+    interval: tuple[float, float]
+    p_value: float
+    detectable: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Verdict of a render against its analytic reference.
+
+    Parameters
+    ----------
+    passed:
+        Whether no test rejects the model at the significance level, shared over the tests (Bonferroni).
+    biases:
+        The template tests, the gain first.
+    z:
+        z score of each pixel, (A, N); nan where left out.
+    z_mean, z_std:
+        Of the kept pixels; (0, 1) is what noise alone makes.
+    largest_z, largest_p:
+        Largest |z| and its Sidak-corrected p-value.
+    uniformity_p:
+        Kolmogorov-Smirnov p-value of the tiles' p-values against the uniform distribution.
+    tile_p:
+        p-value of each tile of pixels, (A, tiles); nan for tiles left out.
+    kept, starved, edges:
+        Numbers of pixels compared, left out as starved, left out as edges.
+    exact:
+        Whether the seeds do not scatter at all (a mirror), so that only rounding is left to compare.
+    """
+
+    passed: bool
+    biases: tuple[BiasTest, ...]
+    z: Array = field(repr=False)
+    z_mean: float
+    z_std: float
+    largest_z: float
+    largest_p: float
+    uniformity_p: float
+    tile_p: Array = field(repr=False)
+    relative_rms: float
+    kept: int
+    starved: int
+    edges: int
+    exact: bool
+
+    @property
+    def gain(self) -> BiasTest:
+        """The overall factor between render and reference, minus one."""
+        return self.biases[0]
+
+    def summary(self) -> dict[str, Any]:
+        """Everything but the maps, ready for JSON."""
+        return {
+            "passed": self.passed,
+            "biases": [
+                {
+                    "name": b.name,
+                    "unit": b.unit,
+                    "estimate": b.estimate,
+                    "standard_error": b.standard_error,
+                    "interval_99": list(b.interval),
+                    "p_value": b.p_value,
+                    "detectable_99": b.detectable,
+                }
+                for b in self.biases
+            ],
+            "z_mean": self.z_mean,
+            "z_std": self.z_std,
+            "largest_z": self.largest_z,
+            "largest_p_sidak": self.largest_p,
+            "uniformity_p": self.uniformity_p,
+            "relative_rms": self.relative_rms,
+            "pixels": {"kept": self.kept, "starved": self.starved, "edges": self.edges},
+            "exact": self.exact,
+        }
+
+
+def compare(
+    seeds: Array,
+    reference: Array,
+    *,
+    templates: dict[tuple[str, str], Array] | None = None,
+    edges: NDArray[np.bool_] | None = None,
+) -> Comparison:
+    """Test whether S renders scatter about an analytic reference.
+
+    Parameters
+    ----------
+    seeds:
+        Independent unbiased renders, shape (S, A, N), S >= 8.
+    reference:
+        The analytic picture, shape (A, N).
+    templates:
+        For each further (name, unit) the change of the reference per unit of that bias, shape (A, N).
+    edges:
+        Pixels to leave out because the reference is discontinuous there, shape (A, N).
+
+    Raises
+    ------
+    InputError
+        For fewer than eight seeds or shapes that do not match.
+    """
+    if seeds.ndim != 3 or seeds.shape[1:] != reference.shape:
+        raise InputError(f"renders of shape {seeds.shape} do not match a reference of shape {reference.shape}")
+    if seeds.shape[0] < 8:
+        raise InputError(f"{seeds.shape[0]} seeds are too few to know their scatter; render at least 8", field="seeds")
+    brightest = float(reference.max())
+    no_edges = np.ones(reference.shape, dtype=bool) if edges is None else ~edges
+    bright = reference > _STARVED * brightest
+    keep = bright & no_edges
+    deviation = seeds - reference
+    scatter = deviation.std(axis=0, ddof=1)
+    exact = bool(np.all(scatter[keep] <= 1e-6 * brightest))
+    weights = np.where(keep, 1.0 / (reference + 1e-2 * brightest) ** 2, 0.0)
+    shapes = {("gain", "of 1"): reference, **(templates or {})}
+    biases = tuple(_bias(name, unit, deviation, shape, weights) for (name, unit), shape in shapes.items())
+    z = _z_scores(deviation, keep)
+    tile_p = _tile_p(deviation, reference, keep)
+    tiles = tile_p[np.isfinite(tile_p)]
+    kept = z[keep]
+    largest = float(np.max(np.abs(kept), initial=0.0))
+    largest_p = float(-np.expm1(kept.size * np.log1p(-2 * stats.norm.sf(largest)))) if kept.size else 1.0
+    uniformity = float(stats.kstest(tiles, "uniform").pvalue) if tiles.size else 1.0
+    relative = deviation.mean(axis=0)[keep] / brightest
+    if exact:
+        # Without scatter there is nothing to test statistically: float32 rounding of a sum of samples remains.
+        passed = bool(np.max(np.abs(relative), initial=0.0) < 1e-5)
+    else:
+        level = SIGNIFICANCE / (len(biases) + 2)
+        passed = min([largest_p, uniformity, *(b.p_value for b in biases)]) > level
+    return Comparison(
+        passed=passed,
+        biases=biases,
+        z=np.where(keep, z, np.nan),
+        z_mean=float(kept.mean()) if kept.size else 0.0,
+        z_std=float(kept.std()) if kept.size else 1.0,
+        largest_z=largest,
+        largest_p=largest_p,
+        uniformity_p=uniformity,
+        tile_p=tile_p,
+        relative_rms=float(np.sqrt(np.mean(relative**2))) if kept.size else 0.0,
+        kept=int(keep.sum()),
+        starved=int((~bright & no_edges).sum()),
+        edges=int((~no_edges).sum()),
+        exact=exact,
+    )
+
+
+def _bias(name: str, unit: str, deviation: Array, shape: Array, weights: Array) -> BiasTest:
+    """Least-squares amplitude of a template in each seed; the weights depend on the reference alone."""
+    power = float(np.sum(weights * shape * shape))
+    if power == 0:
+        return BiasTest(name, unit, 0.0, math.inf, (-math.inf, math.inf), 1.0, math.inf)
+    amplitudes = np.einsum("san,an->s", deviation, weights * shape) / power
+    count = amplitudes.size
+    estimate = float(amplitudes.mean())
+    error = float(amplitudes.std(ddof=1)) / math.sqrt(count)
+    if error == 0:
+        return BiasTest(name, unit, estimate, 0.0, (estimate, estimate), 1.0 if abs(estimate) < 1e-5 else 0.0, 1e-5)
+    half = float(stats.t.ppf(0.995, count - 1)) * error
+    p_value = float(2 * stats.t.sf(abs(estimate) / error, count - 1))
+    # Caught when |t| passes the two-sided threshold; 99 % of the noncentral t must lie beyond it.
+    threshold = float(stats.t.isf(SIGNIFICANCE / 10, count - 1)) + float(stats.t.ppf(_POWER, count - 1))
+    return BiasTest(name, unit, estimate, error, (estimate - half, estimate + half), p_value, threshold * error)
+
+
+def _z_scores(deviation: Array, keep: NDArray[np.bool_]) -> Array:
+    """t over seeds in each pixel, mapped to the normal score of the same probability."""
+    count = deviation.shape[0]
+    error = deviation.std(axis=0, ddof=1) / math.sqrt(count)
+    good = keep & (error > 0)
+    t = np.divide(deviation.mean(axis=0), error, out=np.zeros(error.shape), where=good)
+    # Through the nearer tail, where probabilities keep their precision.
+    return np.asarray(-np.sign(t) * stats.norm.ppf(stats.t.sf(np.abs(t), count - 1)), dtype=np.float64)
+
+
+def _tile_p(deviation: Array, reference: Array, keep: NDArray[np.bool_]) -> Array:
+    """Two-sided p-value of the t test on the mean of each run of pixels, (A, tiles)."""
+    count, views, pixels = deviation.shape
+    tiles = pixels // _TILE
+    if tiles == 0:
+        return np.full((views, 1), np.nan)
+    masked = np.where(keep, deviation, 0.0)[:, :, : tiles * _TILE]
+    sums = masked.reshape(count, views, tiles, _TILE).sum(axis=-1)
+    used = keep[:, : tiles * _TILE].reshape(views, tiles, _TILE).any(axis=-1)
+    error = sums.std(axis=0, ddof=1) / math.sqrt(count)
+    used &= error > 0
+    t = np.divide(sums.mean(axis=0), error, out=np.zeros(error.shape), where=used)
+    p = 2 * stats.t.sf(np.abs(t), count - 1)
+    return np.where(used, p, np.nan)

@@ -1,0 +1,107 @@
+"""The Cramer-Rao bound of blind de-rendering: error bars for the pattern and the BRDF.
+
+The Fisher information of (r, V) has one null direction, the global scale (r, -V). A gauge that fixes a linear
+functional c of r (here the BRDF's peak) removes it: with S the information of r after V is eliminated,
+
+    Cov(r) = (S + k c c^T)^-1 - r r^T / (k (c r)^2),
+    Cov(vec V) = blockdiag(H_b^-1) + [H_b^-1 C_b] Cov(r) [H_b^-1 C_b]^T.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as sl
+from numpy.typing import NDArray
+
+from wallmirror.derendering.likelihood import Moments, information
+from wallmirror.derendering.splines import SplineGrid
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Smallest covariance that an unbiased estimate can have, per unit noise variance in units of the weights.
+
+    Parameters
+    ----------
+    coefficients:
+        Cov(r) over the seen coefficients, shape (K', K').
+    seen:
+        Which of the K coefficients those are, shape (K,).
+    source_std:
+        Standard deviation of V, shape (M, B).
+    source_error:
+        Expected relative error of V in the Frobenius norm after the best global scale.
+    """
+
+    coefficients: Array
+    seen: NDArray[np.bool_]
+    source_std: Array
+    source_error: float
+
+    def brdf_std(self, grid: SplineGrid, u: Array) -> Array:
+        """Standard deviation of rho at angle sums u in radians, same shape; inf where nothing was seen."""
+        rows = np.flatnonzero(self.seen)
+        position = np.full(grid.size, -1)
+        position[rows] = np.arange(rows.size)
+        first, values = grid.basis(u)
+        dense = np.zeros((u.size, rows.size))
+        blind = (u < grid.start) | (u > grid.stop)
+        for k in range(grid.degree + 1):
+            column = position[first + k]
+            blind |= (column < 0) & (values[k] > 1e-3)
+            inside = column >= 0
+            dense[np.flatnonzero(inside), column[inside]] += values[k][inside]
+        variance = np.einsum("uk,kl,ul->u", dense, self.coefficients, dense, optimize=True)
+        return np.where(blind, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+
+
+def cramer_rao(data: Moments, coefficients: Array, source: Array, *, gauge: Array) -> Bound:
+    """The bound at (r, V) in the gauge that holds c r fixed.
+
+    Parameters
+    ----------
+    coefficients:
+        r, shape (K,).
+    source:
+        V, shape (M, B).
+    gauge:
+        c, shape (K,): the values of the basis functions at the peak of rho.
+    """
+    seen = data.seen
+    schur, inverse, coupled = information(data, coefficients, source)
+    c, r = gauge[seen], coefficients[seen]
+    strength = float(np.trace(schur)) / max(1, schur.shape[0]) / max(float(c @ c), 1e-300)
+    pinned = schur + strength * np.outer(c, c)
+    # Barely seen cells: a ridge far below their neighbours' information keeps their (huge) variance finite.
+    ridge = 1e-12 * float(np.trace(schur)) / max(1, schur.shape[0])
+    pinned[np.diag_indices_from(pinned)] += ridge
+    covariance = sl.inv(pinned)
+    along = float(c @ r)
+    if along != 0:
+        covariance -= np.outer(r, r) / (strength * along**2)
+    covariance = 0.5 * (covariance + covariance.T)
+    variance = np.einsum("bii->bi", inverse) + np.einsum("bik,kl,bil->bi", coupled, covariance, coupled, optimize=True)
+    return Bound(
+        coefficients=covariance,
+        seen=seen,
+        source_std=np.sqrt(np.maximum(variance, 0.0)).T,
+        source_error=_scale_free_error(source, inverse, coupled, covariance),
+    )
+
+
+def _scale_free_error(source: Array, inverse: Array, coupled: Array, covariance: Array) -> float:
+    """sqrt(E |dV|^2) / |V| with dV freed of its part along V, which a global scale absorbs."""
+    v = source.T  # (B, M)
+    norm = float(np.sum(v * v))
+    if norm == 0:
+        return float("inf")
+    total = float(np.einsum("bii->", inverse))
+    total += float(np.einsum("bik,kl,bil->", coupled, covariance, coupled, optimize=True))
+    # Along V: v^T Cov v / |V|^2.
+    pulled = np.einsum("bi,bik->k", v, coupled)
+    along = float(np.einsum("bi,bij,bj->", v, inverse, v)) + float(pulled @ covariance @ pulled)
+    return float(np.sqrt(max(total - along / norm, 0.0) / norm))

@@ -1,0 +1,288 @@
+"""Maximum likelihood by variable projection: the estimate that noise calls for, and its error bars.
+
+The log-likelihood of D = F(r) V + noise is, up to a constant, -1/2 sum_pb w_pb (D - F V)^2 with w the inverse
+variances. Everything that an iteration needs fits in coefficient space after one pass over the data,
+
+    N_ij = T_i^T W T_j,      X_ib = T_i^T W d_b,
+
+so that an iteration does not touch the pixels. With J_b = sum_i V_ib T_i, H_b = F^T W F, C_b = F^T W J_b the
+Gauss-Newton step eliminates V (variable projection; Golub and Pereyra, SIAM J. Numer. Anal. 10(2), 1973):
+
+    S = sum_b J_b^T W J_b - C_b^T H_b^-1 C_b,
+    S dr = sum_b J_b^T W e_b - C_b^T H_b^-1 F^T W e_b,      dv_b = H_b^-1 (F^T W e_b - C_b dr).
+
+S is also the Fisher information of r with V eliminated; its null vector is r itself, the global scale.
+Non-negativity is imposed by projected Newton steps (Bertsekas, SIAM J. Control Optim. 20(2), 1982).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as sl
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Cells whose Fisher information lies this far below the best-seen cell's are left out of the fit.
+_SEEN = 1e-10
+
+
+@dataclass(frozen=True)
+class Moments:
+    """The data in coefficient space.
+
+    Parameters
+    ----------
+    grams:
+        N_ij for i <= j and each group of realisations that share weights, csr (K, K).
+    group:
+        Group of each realisation, shape (B,).
+    cross:
+        X, shape (B, M, K).
+    energy:
+        sum_p w d^2 of each realisation, shape (B,).
+    observations:
+        Number of data with weight > 0.
+    """
+
+    grams: list[dict[tuple[int, int], sp.csr_array]]
+    group: NDArray[np.intp]
+    cross: Array
+    energy: Array
+    observations: int
+
+    @property
+    def elements(self) -> int:
+        """M."""
+        return int(self.cross.shape[1])
+
+    @property
+    def size(self) -> int:
+        """K."""
+        return int(self.cross.shape[2])
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Which coefficients the captures see at all, shape (K,)."""
+        information = np.zeros(self.size)
+        for grams in self.grams:
+            for i in range(self.elements):
+                information += grams[i, i].diagonal()
+        return np.asarray(information > _SEEN * information.max(initial=0.0))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A maximum of the likelihood.
+
+    Parameters
+    ----------
+    coefficients:
+        r, shape (K,).
+    source:
+        V, shape (M, B).
+    objective:
+        sum w (D - F V)^2 at the maximum.
+    iterations:
+        Newton steps taken.
+    converged:
+        Whether the last step was below the tolerance.
+    """
+
+    coefficients: Array
+    source: Array
+    objective: float
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True)
+class _State:
+    r: Array
+    v: Array  # (B, M)
+    normal: Array  # H, (G, M, M)
+    pair: Array  # N_ij r, (G, M, M, K)
+    objective: float
+
+
+def moments(data: Array, designs: list[sp.csr_array], inverse_variance: Array | None = None) -> Moments:
+    """One pass over the data (P, B): the Gram matrices and cross products that the fit needs.
+
+    Parameters
+    ----------
+    inverse_variance:
+        w, shape (P, B); 0 leaves a pixel out. Left out altogether, all weights are 1.
+    """
+    realisations = data.shape[1]
+    if inverse_variance is None:
+        inverse_variance = np.ones((data.shape[0], 1))
+    weights, group = np.unique(inverse_variance, axis=1, return_inverse=True)
+    group = np.broadcast_to(np.asarray(group).ravel(), (realisations,))
+    full = weights[:, group]
+    weighted = full * data
+    cross = np.stack([(t.T @ weighted).T for t in designs], axis=1)
+    grams = [_grams(designs, weights[:, g]) for g in range(weights.shape[1])]
+    return Moments(
+        grams=grams,
+        group=group.astype(np.intp),
+        cross=cross,
+        energy=np.sum(weighted * data, axis=0),
+        observations=int(np.count_nonzero(full > 0)),
+    )
+
+
+def _grams(designs: list[sp.csr_array], weight: Array) -> dict[tuple[int, int], sp.csr_array]:
+    grams = {}
+    for j, right in enumerate(designs):
+        scaled = right.copy()
+        scaled.data = scaled.data * np.repeat(weight, np.diff(scaled.indptr))
+        for i in range(j + 1):
+            grams[i, j] = sp.csr_array(designs[i].T @ scaled)
+    return grams
+
+
+def maximise(
+    data: Moments,
+    coefficients: Array,
+    *,
+    source: Array | None = None,
+    nonnegative: bool = True,
+    tolerance: float = 1e-9,
+    max_iterations: int = 60,
+) -> Fit:
+    """Climb to the maximum of the likelihood from a start near it (the closed form's r).
+
+    Parameters
+    ----------
+    coefficients:
+        Start of r, shape (K,).
+    source:
+        Start of V, shape (M, B); the best one for `coefficients` when left out.
+    nonnegative:
+        Keep r >= 0 and V >= 0.
+    tolerance:
+        Stop when a full step changes the objective by less than this share of its noise-like part.
+    """
+    seen = data.seen
+    r = np.where(seen, coefficients, 0.0)
+    if nonnegative:
+        r = np.maximum(r, 0.0)
+    v = None if source is None else np.array(source.T)
+    state = _evaluate(data, r, v, nonnegative=nonnegative)
+    for iteration in range(1, max_iterations + 1):
+        dr, dv, slope = _step(data, state, seen, nonnegative=nonnegative)
+        if slope <= tolerance * max(state.objective, 1e-300):
+            return _fit(state, iteration, converged=True)
+        length = 1.0
+        while True:
+            r_new, v_new = state.r + length * dr, state.v + length * dv
+            if nonnegative:
+                r_new, v_new = np.maximum(r_new, 0.0), np.maximum(v_new, 0.0)
+            trial = _evaluate(data, r_new, v_new, nonnegative=nonnegative)
+            if trial.objective <= state.objective - 1e-4 * length * slope:
+                break
+            length /= 2
+            if length < 1e-10:
+                return _fit(state, iteration, converged=slope <= 1e-6 * state.objective)
+        state = trial
+    return _fit(state, max_iterations, converged=False)
+
+
+def information(data: Moments, coefficients: Array, source: Array) -> tuple[Array, Array, Array]:
+    """Fisher information in units of the weights: S over the seen cells, H_b^-1 and H_b^-1 C_b.
+
+    Returns
+    -------
+    S of shape (K', K') for the K' seen coefficients, H_b^-1 (B, M, M), H_b^-1 C_b (B, M, K').
+    """
+    seen = data.seen
+    state = _evaluate(data, coefficients, source.T, nonnegative=True)
+    gram, inverse, coupled = _schur(data, state, np.ones_like(state.v, dtype=bool), np.flatnonzero(seen))
+    return gram, inverse, coupled
+
+
+def _fit(state: _State, iterations: int, *, converged: bool) -> Fit:
+    return Fit(state.r, state.v.T.copy(), state.objective, iterations, converged)
+
+
+def _evaluate(data: Moments, r: Array, v: Array | None, *, nonnegative: bool) -> _State:
+    m = data.elements
+    pair = np.empty((len(data.grams), m, m, data.size))
+    for g, grams in enumerate(data.grams):
+        for (i, j), gram in grams.items():
+            pair[g, i, j] = gram @ r
+            if i != j:
+                pair[g, j, i] = gram.T @ r
+    normal = pair @ r
+    moment = data.cross @ r  # (B, M)
+    if v is None:
+        ridge = 1e-14 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(m)
+        v = np.linalg.solve((normal + ridge)[data.group], moment[..., None])[..., 0]
+        if nonnegative:
+            v = np.maximum(v, 0.0)
+    quadratic = np.einsum("bi,bij,bj->b", v, normal[data.group], v)
+    objective = float(np.sum(data.energy - 2 * np.sum(v * moment, axis=1) + quadratic))
+    return _State(r, v, normal, pair, objective)
+
+
+def _step(data: Moments, state: _State, seen: NDArray[np.bool_], *, nonnegative: bool) -> tuple[Array, Array, float]:
+    """The (projected) Gauss-Newton step in r and V, and the decrease of the objective that it promises."""
+    by_group = state.pair[data.group]  # (B, M, M, K)
+    residual = data.cross - np.einsum("bijk,bj->bik", by_group, state.v)  # T_i^T W e_b
+    grad_r = np.einsum("bi,bik->k", state.v, residual)
+    grad_v = residual @ state.r
+    free_r, free_v = seen.copy(), np.ones_like(state.v, dtype=bool)
+    if nonnegative:
+        free_r &= (state.r > 0) | (grad_r > 0)
+        free_v &= (state.v > 0) | (grad_v > 0)
+    cells = np.flatnonzero(free_r)
+    schur, inverse, coupled = _schur(data, state, free_v, cells)
+    eliminated = np.einsum("bmk,bm->k", coupled, np.where(free_v, grad_v, 0.0))
+    right = grad_r[cells] - eliminated
+    r = state.r[cells]
+    level = np.trace(schur) / max(1, cells.size)
+    if level > 0:
+        # The gauge r r^T keeps the step off the scale's null direction; the ridge is for barely seen cells.
+        schur += level * np.outer(r, r) / max(float(r @ r), 1e-300)
+        schur[np.diag_indices_from(schur)] += 1e-12 * level
+        step = sl.solve(schur, right, assume_a="pos")
+    else:
+        step = np.zeros(cells.size)
+    dr = np.zeros_like(state.r)
+    dr[cells] = step
+    dv = np.einsum("bij,bj->bi", inverse, np.where(free_v, grad_v, 0.0)) - coupled @ step
+    slope = float(grad_r @ dr + np.sum(grad_v * dv))
+    return dr, dv, slope
+
+
+def _schur(
+    data: Moments, state: _State, free: NDArray[np.bool_], cells: NDArray[np.intp]
+) -> tuple[Array, Array, Array]:
+    """S on the given cells, and H_b^-1, H_b^-1 C_b with the rows of fixed source entries zero."""
+    m, size = data.elements, data.size
+    total = np.zeros((size, size))
+    for g, grams in enumerate(data.grams):
+        v = state.v[data.group == g]
+        products = v.T @ v
+        for (i, j), gram in grams.items():
+            coo = gram.tocoo()
+            row, column = coo.coords
+            if products[i, j] != 0:
+                total[row, column] += products[i, j] * coo.data
+                if i != j:
+                    total[column, row] += products[i, j] * coo.data
+    normal = state.normal[data.group].copy()
+    both = free[:, :, None] & free[:, None, :]
+    normal = np.where(both, normal, np.eye(m) * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-300)
+    ridge = 1e-14 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(m)
+    inverse = np.where(both, np.linalg.inv(normal + ridge), 0.0)
+    # C_b[i] = sum_j v_j (T_j^T W T_i r)
+    coupling = np.einsum("bj,bjik->bik", state.v, state.pair[data.group][..., cells])
+    coupled = inverse @ coupling
+    schur = total[np.ix_(cells, cells)]
+    for b in range(coupling.shape[0]):
+        schur -= coupling[b].T @ coupled[b]
+    return 0.5 * (schur + schur.T), inverse, coupled

@@ -1,0 +1,149 @@
+"""A capture set made ready for the solvers: normalised data, weights, and the rank that it carries."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from wallmirror.captures import CaptureSet
+from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
+from wallmirror.derendering.subspace import SignalSpace, signal_space
+from wallmirror.errors import UndeterminedError
+from wallmirror.geometry import Card
+from wallmirror.transport import build_kernel
+
+Array = NDArray[np.float64]
+
+# Variances below this share of the largest are raised to it: a pixel that saw no noise by luck must not outweigh
+# all others, and no spline follows a lobe's tail to better than about a hundredth of the noise at its peak.
+_VARIANCE_FLOOR = 1e-4
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A capture set normalised to order one.
+
+    Parameters
+    ----------
+    data:
+        D / scale, shape (P, B).
+    inverse_variance:
+        Weights, shape (P, B), 0 for saturated pixels; None for equal weights.
+    noise_is_stated:
+        Whether the weights are inverse variances of all noise, and not only tell which pixels count.
+    """
+
+    captures: CaptureSet
+    data: Array
+    inverse_variance: Array | None
+    noise_is_stated: bool
+    scale: float
+
+    @property
+    def card(self) -> Card:
+        """The card whose pattern is sought."""
+        return self.captures.card
+
+    @cached_property
+    def row_weights(self) -> Array:
+        """Square root of each row's mean inverse variance, shape (P, 1): makes the noise of the rows alike."""
+        if self.inverse_variance is None:
+            return np.ones((self.data.shape[0], 1))
+        weights: Array = np.sqrt(np.mean(self.inverse_variance, axis=1, keepdims=True))
+        return weights
+
+    @cached_property
+    def weighted_data(self) -> Array:
+        """D with weighted rows, shape (P, B)."""
+        return self.row_weights * self.data
+
+    def weighted(self, designs: list[sp.csr_array]) -> list[sp.csr_array]:
+        """T_1 .. T_M with weighted rows."""
+        if self.inverse_variance is None:
+            return designs
+        return [sp.csr_array(t.multiply(self.row_weights)) for t in designs]
+
+    def designs(self, step_deg: float, *, degree: int, tolerance: float) -> tuple[SplineGrid, list[sp.csr_array]]:
+        """The spline grid of one knot spacing and the transport over it, with quadrature to match."""
+        step = math.radians(step_deg)
+        kernel = build_kernel(
+            self.captures.observer,
+            self.captures.card,
+            weights=self.captures.transport,
+            resolution=2 * step,
+            tolerance=tolerance,
+        )
+        grid = grid_for(kernel, step=step, degree=degree)
+        return grid, design_matrices(kernel, grid)
+
+
+def prepare(captures: CaptureSet) -> tuple[Problem, SignalSpace]:
+    """Normalise a capture set and find the space of its patterns.
+
+    Raises
+    ------
+    UndeterminedError
+        When no solver could succeed: coincident elements, too few or too similar patterns, darkness, saturation.
+    """
+    views, pixels, realisations = captures.radiance.shape
+    elements = captures.card.elements
+    if len(set(captures.card.elements_x)) < elements:
+        raise UndeterminedError(
+            "two elements of the card stand at the same place, so their light cannot be told apart; give each its "
+            "own position"
+        )
+    if realisations < elements:
+        raise UndeterminedError(
+            f"{realisations} realisation(s) of the pattern cannot determine {elements} elements; capture at least "
+            f"{elements} different patterns"
+        )
+    if views * pixels <= elements:
+        raise UndeterminedError(
+            f"{views * pixels} pixel(s) cannot determine {elements} elements and a BRDF; use more pixels or views"
+        )
+    data = captures.radiance.reshape(views * pixels, realisations)
+    scale = float(np.abs(data).max(initial=0.0))
+    if scale == 0:
+        raise UndeterminedError("every capture is dark; light the card and capture again")
+    inverse = None
+    if captures.variance is not None:
+        inverse = _inverse_variance(captures.variance.reshape(data.shape) / scale / scale)
+        if captures.variance_is_floor:
+            # Rounding is known, the noise above it is not: all pixels alike, the saturated ones out.
+            inverse = None if np.all(inverse > 0) else (inverse > 0).astype(np.float64)
+    stated = inverse is not None and not captures.variance_is_floor
+    problem = Problem(captures, data / scale, inverse, stated, scale)
+    return problem, _signal_space(problem)
+
+
+def _inverse_variance(variance: Array) -> Array:
+    finite = np.isfinite(variance)
+    if not finite.any():
+        raise UndeterminedError("every pixel is saturated; expose for less time and capture again")
+    floor = _VARIANCE_FLOOR * float(variance[finite].max()) or 1.0
+    return np.where(finite, 1.0 / np.maximum(variance, floor), 0.0)
+
+
+def _signal_space(problem: Problem) -> SignalSpace:
+    """The leading M directions, with the rank counted above the noise's largest singular value."""
+    rows, realisations = problem.data.shape
+    elements = problem.card.elements
+    # Noise of unit variance reaches singular values of about sqrt(P) + sqrt(B) (Marchenko and Pastur 1967).
+    floor = math.sqrt(rows) + math.sqrt(realisations) if problem.noise_is_stated else 0.0
+    space = signal_space(problem.weighted_data, elements, noise_floor=floor)
+    if not problem.noise_is_stated and realisations > elements:
+        tail = float(np.sqrt(np.mean(space.singular_values[elements:] ** 2)))
+        floor = tail * (1 + math.sqrt(realisations / rows))
+        rank = int(np.count_nonzero(space.singular_values[:elements] > floor))
+        space = SignalSpace(space.basis, space.singular_values, min(rank, space.rank))
+    if space.rank < elements:
+        raise UndeterminedError(
+            f"the captures span only {space.rank} independent pattern(s) above the noise, but the card has "
+            f"{elements} elements; capture more different patterns, or more light"
+        )
+    return space

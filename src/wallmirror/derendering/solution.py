@@ -1,0 +1,261 @@
+"""What a de-rendering returns: the estimates, and everything that says how far to trust them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wallmirror.derendering.problem import Problem
+from wallmirror.derendering.splines import SplineGrid
+from wallmirror.derendering.subspace import ClosedForm, SignalSpace
+from wallmirror.errors import UndeterminedError
+
+Array = NDArray[np.float64]
+
+Verdict = Literal["good", "doubtful"]
+
+# Error bars beyond this share of the pattern mean that the data do not determine it.
+_UNDETERMINED = 0.5
+_CURVE_NODES = 2401
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solution:
+    """A recovered pattern and BRDF with their doubts.
+
+    Parameters
+    ----------
+    status:
+        A sentence that says how far to trust the result and what to do next.
+    verdict:
+        "good", or "doubtful" when a warning stands.
+    warnings:
+        One sentence for each reason to doubt.
+    method:
+        "closed_form" or "maximum_likelihood".
+    source, source_std:
+        V and its standard deviations, shape (M, B), in the gauge where the BRDF peaks at 1.
+    angle_sum, brdf, brdf_std:
+        rho on uniform nodes of u = theta_s + theta_o (radians), shape (L,); the standard deviation is inf where
+        no capture saw that angle.
+    transport:
+        F, shape (A, N, M), in the same gauge.
+    rank:
+        Rank of the data that stands out of noise and rounding, out of M.
+    mismatch, mismatch_expected:
+        1 - lambda_1 of the closed form, and what the noise alone would make of it (nan where it is unknown).
+    gap:
+        1 - lambda_2: 0 means that a second BRDF explains the data as well.
+    condition:
+        Condition number of F.
+    components:
+        Number of parts with a scale of their own; 1 is the unavoidable global scale.
+    predicted_error:
+        Expected relative error of V after the best global scale, from the Cramer-Rao bound.
+    residual:
+        |D - F V| / |D|.
+    chi_squared:
+        Residual in units of the noise variance per degree of freedom (nan where no variance is known).
+    step_deg:
+        Knot spacing of the BRDF's spline in degrees.
+    seconds:
+        Time the solver took.
+    """
+
+    status: str
+    verdict: Verdict
+    warnings: tuple[str, ...]
+    method: str
+    source: Array = field(repr=False)
+    source_std: Array = field(repr=False)
+    angle_sum: Array = field(repr=False)
+    brdf: Array = field(repr=False)
+    brdf_std: Array = field(repr=False)
+    transport: Array = field(repr=False)
+    rank: int
+    mismatch: float
+    mismatch_expected: float
+    gap: float
+    condition: float
+    components: int
+    predicted_error: float
+    residual: float
+    chi_squared: float
+    step_deg: float
+    seconds: float
+
+    def summary(self) -> dict[str, Any]:
+        """Everything but the large arrays, ready for JSON (infinities and nan become null)."""
+        scalars = {
+            name: getattr(self, name)
+            for name in [
+                "status",
+                "verdict",
+                "method",
+                "rank",
+                "mismatch",
+                "mismatch_expected",
+                "gap",
+                "condition",
+                "components",
+                "predicted_error",
+                "residual",
+                "chi_squared",
+                "step_deg",
+                "seconds",
+            ]
+        }
+        return {
+            **{k: _finite(v) for k, v in scalars.items()},
+            "warnings": list(self.warnings),
+            "gauge": "max rho = 1",
+            "source": _finite(self.source.tolist()),
+            "source_std": _finite(self.source_std.tolist()),
+        }
+
+    def to_json(self) -> str:
+        """`summary` as a JSON document."""
+        return json.dumps(self.summary(), indent=2, allow_nan=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """What one method found, in the solver's own scale and before it is judged.
+
+    Parameters
+    ----------
+    closed:
+        The closed form that it is or that it started from, with its certificates.
+    coefficients, source, transport:
+        r (K,), V (M, B), F (P, M) with F V = D / scale.
+    source_std:
+        Standard deviation of V, shape (M, B), in the gauge where the BRDF's peak is held fixed.
+    brdf_std:
+        Standard deviation of rho at given angle sums.
+    """
+
+    method: str
+    grid: SplineGrid
+    closed: ClosedForm
+    coefficients: Array
+    source: Array
+    transport: Array
+    source_std: Array
+    brdf_std: Callable[[Array], Array]
+    predicted_error: float
+    chi_squared: float
+    warnings: tuple[str, ...]
+
+
+def conclude(problem: Problem, space: SignalSpace, estimate: Estimate, *, seconds: Callable[[], float]) -> Solution:
+    """Put an estimate into the gauge max rho = 1, attach its certificates and say in words how far to trust it.
+
+    Raises
+    ------
+    UndeterminedError
+        When several BRDFs explain the data alike, or the error bars are as large as the pattern.
+    """
+    closed, grid = estimate.closed, estimate.grid
+    if estimate.method == "closed_form" and closed.near_solutions > 1:
+        raise UndeterminedError(
+            f"{closed.near_solutions} different BRDFs explain the captures equally well (gap {closed.gap:.1e}); use a "
+            "card or views whose reflections share more angles"
+        )
+    if not estimate.predicted_error <= _UNDETERMINED:
+        raise UndeterminedError(
+            f"the captures leave the pattern undetermined (its error bars come to {100 * estimate.predicted_error:.0f} "
+            "% of it); capture more light, more views or more patterns"
+        )
+    peak_at = grid.peak(estimate.coefficients)
+    peak = float(grid.evaluate(estimate.coefficients, peak_at))
+    # Samples that include the peak, so that the curve's maximum is 1 to rounding.
+    u = np.unique(np.append(np.linspace(grid.start, grid.stop, _CURVE_NODES), peak_at))
+    views, pixels, _ = problem.captures.radiance.shape
+    missed = np.linalg.norm(problem.data - estimate.transport @ estimate.source)
+    warnings = list(estimate.warnings)
+    expected = _expected_mismatch(problem, space, closed)
+    if estimate.method != "closed_form" and closed.mismatch > 10 * expected and closed.mismatch > 1e-6:
+        warnings.append(
+            f"the closed form misses the data's space by {closed.mismatch:.1e} where noise explains {expected:.1e}, so "
+            "the geometry, Hypothesis 2 (one bounce) or Hypothesis 8 (angle sum) does not hold"
+        )
+    return Solution(
+        status=_status(problem, estimate, warnings),
+        verdict="doubtful" if warnings else "good",
+        warnings=tuple(warnings),
+        method=estimate.method,
+        source=estimate.source * peak * problem.scale,
+        source_std=estimate.source_std * peak * problem.scale,
+        angle_sum=u,
+        brdf=grid.evaluate(estimate.coefficients, u) / peak,
+        brdf_std=estimate.brdf_std(u) / peak,
+        transport=(estimate.transport / peak).reshape(views, pixels, -1),
+        rank=space.rank,
+        mismatch=closed.mismatch,
+        mismatch_expected=expected,
+        gap=closed.gap,
+        condition=float(np.linalg.cond(estimate.transport)),
+        components=1,
+        predicted_error=estimate.predicted_error,
+        residual=float(missed / np.linalg.norm(problem.data)),
+        chi_squared=estimate.chi_squared,
+        step_deg=math.degrees(grid.step),
+        seconds=seconds(),
+    )
+
+
+def _expected_mismatch(problem: Problem, space: SignalSpace, closed: ClosedForm) -> float:
+    """1 - lambda_1 that noise alone makes: s^2 (P - M) |V^+|^2 / |F|^2, from first-order perturbation of U.
+
+    s^2 is 1 where the rows are whitened by stated variances, else the mean square of the singular values beyond M.
+    """
+    rows, realisations = problem.data.shape
+    elements = problem.card.elements
+    if problem.noise_is_stated:
+        noise = 1.0
+    elif realisations > elements:
+        noise = float(np.sum(space.singular_values[elements:] ** 2)) / (rows * (realisations - elements))
+    else:
+        return math.nan
+    inverse = np.linalg.pinv(closed.source)
+    return float(noise * (rows - elements) * np.sum(inverse**2) / np.sum(closed.transport**2))
+
+
+def _status(problem: Problem, estimate: Estimate, warnings: list[str]) -> str:
+    how = "in closed form" if estimate.method == "closed_form" else "by maximum likelihood"
+    found = (
+        f"Recovered {problem.card.elements} elements in {problem.data.shape[1]} patterns {how}; expect the pattern to be "
+        f"{100 * estimate.predicted_error:.2g} % off, up to one global scale."
+    )
+    if not warnings:
+        return f"{found} No certificate objects."
+    more = f" ({len(warnings) - 1} more warning{'s' if len(warnings) > 2 else ''}.)" if len(warnings) > 1 else ""
+    return f"{found} But {warnings[0]}.{more}"
+
+
+def scale_free_error(estimate: Array, truth: Array) -> float:
+    """Relative Frobenius error after the best global scale of the estimate.
+
+    Examples
+    --------
+    >>> scale_free_error(np.array([2.0, 4.0]), np.array([1.0, 2.0]))
+    0.0
+    """
+    power = float(np.sum(estimate * estimate))
+    scale = float(np.sum(estimate * truth)) / power if power > 0 else 0.0
+    return float(np.linalg.norm(scale * estimate - truth) / np.linalg.norm(truth))
+
+
+def _finite(value: Any) -> Any:
+    """Replace what JSON has no word for."""
+    if isinstance(value, list):
+        return [_finite(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

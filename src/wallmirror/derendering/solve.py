@@ -1,0 +1,181 @@
+"""Blind de-rendering of a capture set: which method, which knot spacing, and what the certificates say.
+
+The closed form (`subspace`) is exact without noise. With noise it is the start of the maximum likelihood fit
+(`likelihood`), whose error bars come from the Cramer-Rao bound (`bounds`). Every result carries its doubts.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wallmirror.captures import CaptureSet
+from wallmirror.derendering.bounds import cramer_rao
+from wallmirror.derendering.likelihood import Fit, Moments, maximise, moments
+from wallmirror.derendering.problem import Problem, prepare
+from wallmirror.derendering.solution import Estimate, Solution, conclude
+from wallmirror.derendering.splines import SplineGrid
+from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form
+from wallmirror.errors import InputError
+
+Array = NDArray[np.float64]
+
+Method = Literal["auto", "closed_form", "maximum_likelihood"]
+
+#: Knot spacings in degrees, tried in turn while finer ones still pay.
+_EXACT_STEPS = (1.0, 0.25, 0.0625)
+_NOISY_STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
+_EXACT_DEGREE = 7
+_NOISY_DEGREE = 3
+# Below this mismatch the data count as free of noise: float64 renders end near 1e-24, float32 files near 1e-13.
+_NOISELESS = 1e-15
+
+
+def solve(
+    captures: CaptureSet,
+    *,
+    method: Method = "auto",
+    nonnegative: bool = True,
+    step_deg: float | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Solution:
+    """Recover the card's pattern and the wall's BRDF together from a capture set.
+
+    Parameters
+    ----------
+    captures:
+        Radiance (A, N, B) with geometry and, if known, variances.
+    method:
+        "closed_form" (exact without noise), "maximum_likelihood", or "auto": the closed form when its own
+        certificate finds no noise, else maximum likelihood.
+    nonnegative:
+        Keep rho >= 0 and V >= 0 in the maximum likelihood fit.
+    step_deg:
+        Knot spacing of the BRDF in degrees; chosen by the data when left out.
+    progress:
+        Called with a sentence at each stage.
+
+    Raises
+    ------
+    InputError
+        For an unknown method or a spacing out of range.
+    UndeterminedError
+        When the data cannot determine the answer, with what would.
+    """
+    if method not in get_args(Method):
+        raise InputError(f'is "{method}"; choose one of {", ".join(get_args(Method))}', field="method")
+    if step_deg is not None and not 0.001 <= step_deg <= 45:
+        raise InputError(f"is {step_deg:g}; give a knot spacing from 0.001 to 45 degrees", field="step_deg")
+    started = time.perf_counter()
+    tell = progress or (lambda _: None)
+    problem, space = prepare(captures)
+    estimate = None
+    if method != "maximum_likelihood":
+        tell("closed form")
+        exact = _closed_form(problem, space, (step_deg,) if step_deg else _EXACT_STEPS)
+        if method == "closed_form" or exact.closed.mismatch < _NOISELESS:
+            estimate = exact
+    if estimate is None:
+        tell("maximum likelihood")
+        estimate = _maximum_likelihood(problem, space, (step_deg,) if step_deg else _NOISY_STEPS, nonnegative, tell)
+    return conclude(problem, space, estimate, seconds=lambda: time.perf_counter() - started)
+
+
+def _closed_form(problem: Problem, space: SignalSpace, steps: tuple[float, ...]) -> Estimate:
+    """Quarter the knot spacing while the mismatch falls to a third, then try the spacing halfway."""
+
+    def at(step: float) -> tuple[SplineGrid, ClosedForm]:
+        grid, designs = problem.designs(step, degree=_EXACT_DEGREE, tolerance=1e-9)
+        return grid, closed_form(problem.weighted_data, problem.weighted(designs), space)
+
+    grid, closed = at(steps[0])
+    for step in steps[1:]:
+        finer = at(step)
+        if finer[1].mismatch > closed.mismatch / 3:
+            halfway = at(2 * step)
+            if halfway[1].mismatch < closed.mismatch / 3:
+                grid, closed = halfway
+            break
+        grid, closed = finer
+    warnings: tuple[str, ...] = ()
+    if closed.mismatch > 1e-8:
+        warnings = (
+            f"the closed form misses the data by {math.sqrt(closed.mismatch):.1e}: there is noise or the geometry is "
+            "off, and maximum likelihood would do better",
+        )
+    # The subspace turns by at most sqrt(mismatch) / gap, and with it pattern and BRDF (Davis and Kahan 1970).
+    error = math.sqrt(closed.mismatch) / max(closed.gap, 1e-300) + 1e-15
+    return Estimate(
+        method="closed_form",
+        grid=grid,
+        closed=closed,
+        coefficients=closed.coefficients,
+        source=closed.source,
+        transport=closed.transport / problem.row_weights,
+        source_std=np.full(closed.source.shape, error * float(np.sqrt(np.mean(closed.source**2)))),
+        brdf_std=lambda u: np.full(u.shape, error * float(np.max(grid.evaluate(closed.coefficients, u)))),
+        predicted_error=error,
+        chi_squared=math.nan,
+        warnings=warnings,
+    )
+
+
+def _maximum_likelihood(
+    problem: Problem,
+    space: SignalSpace,
+    steps: tuple[float, ...],
+    nonnegative: bool,
+    tell: Callable[[str], None],
+) -> Estimate:
+    """Halve the knot spacing while that explains more than as many coefficients would of noise (Akaike 1974)."""
+    best: tuple[SplineGrid, ClosedForm, Moments, Fit] | None = None
+    idle = 0
+    for step in steps:
+        grid, designs = problem.designs(step, degree=_NOISY_DEGREE, tolerance=1e-5)
+        closed = closed_form(problem.weighted_data, problem.weighted(designs), space)
+        summed = moments(problem.data, designs, problem.inverse_variance)
+        fit = maximise(summed, closed.coefficients, nonnegative=nonnegative)
+        tell(f"knots every {step:g} deg: misfit {fit.objective:.6g} after {fit.iterations} steps")
+        if best is not None:
+            variance = fit.objective / max(1, summed.observations - summed.size)
+            if best[3].objective - fit.objective < 2 * (summed.size - best[2].size) * variance:
+                idle += 1
+                if idle == 2:
+                    break
+                continue
+        best, idle = (grid, closed, summed, fit), 0
+    assert best is not None
+    grid, closed, summed, fit = best
+    _, designs = problem.designs(math.degrees(grid.step), degree=_NOISY_DEGREE, tolerance=1e-5)
+    parameters = int(np.count_nonzero(summed.seen)) + fit.source.size
+    reduced = fit.objective / max(1, summed.observations - parameters)
+    stated = problem.noise_is_stated
+    # Where the noise is stated, a misfit beyond it widens the bars; where it is not, the misfit is the noise.
+    sigma = math.sqrt(max(1.0, reduced) if stated else reduced)
+    bound = cramer_rao(summed, fit.coefficients, fit.source, gauge=grid.row(grid.peak(fit.coefficients)))
+    warnings = []
+    if not fit.converged:
+        warnings.append("the fit stopped before it converged, so the error bars may be too small")
+    if stated and reduced > 1.2:
+        warnings.append(
+            f"the misfit is {reduced:.2f} times the stated noise, so the model (one bounce, angle-sum BRDF, geometry) or "
+            "the stated variances do not hold; the error bars were widened to match"
+        )
+    return Estimate(
+        method="maximum_likelihood",
+        grid=grid,
+        closed=closed,
+        coefficients=fit.coefficients,
+        source=fit.source,
+        transport=np.stack([t @ fit.coefficients for t in designs], axis=1),
+        source_std=sigma * bound.source_std,
+        brdf_std=lambda u: sigma * bound.brdf_std(grid, u),
+        predicted_error=sigma * bound.source_error,
+        chi_squared=reduced if stated else math.nan,
+        warnings=tuple(warnings),
+    )

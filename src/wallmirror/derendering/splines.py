@@ -1,0 +1,139 @@
+"""The unknown BRDF as a uniform B-spline in the angle sum, and the transport as sparse matrices over it.
+
+With rho(u) = sum_k r_k phi_k(u) the transport of each element is linear in r: F[:, i] = T_i r, where T_i
+(P x K) sums the kernel's weight times phi_k over the quadrature nodes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import ArrayLike, NDArray
+
+from wallmirror.transport import Kernel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SplineGrid:
+    """K uniform B-splines of one degree that cover [start, start + intervals * step].
+
+    Parameters
+    ----------
+    start, step:
+        First knot interval's beginning and the intervals' length, in radians.
+    intervals:
+        Number of knot intervals covered.
+    degree:
+        Polynomial degree; K = intervals + degree.
+    """
+
+    start: float
+    step: float
+    intervals: int
+    degree: int
+
+    @classmethod
+    def covering(cls, low: float, high: float, *, step: float, degree: int) -> SplineGrid:
+        """The grid of the given step whose intervals contain [low, high], in radians."""
+        intervals = max(1, math.ceil((high - low) / step * (1 + 1e-12) + 1e-9))
+        return cls(start=0.5 * (low + high) - 0.5 * intervals * step, step=step, intervals=intervals, degree=degree)
+
+    @property
+    def size(self) -> int:
+        """K, the number of coefficients."""
+        return self.intervals + self.degree
+
+    @property
+    def stop(self) -> float:
+        """End of the covered range in radians."""
+        return self.start + self.intervals * self.step
+
+    def basis(self, u: ArrayLike) -> tuple[NDArray[np.intp], Array]:
+        """First index and the degree + 1 non-zero values at each u; shapes u.shape and (degree + 1, *u.shape).
+
+        Cardinal B-spline recursion of Cox and de Boor; angles outside the grid are clipped to its ends.
+        """
+        place = np.clip((np.asarray(u, dtype=np.float64) - self.start) / self.step, 0.0, self.intervals)
+        first = np.minimum(place.astype(np.intp), self.intervals - 1)
+        t = place - first
+        values = np.empty((self.degree + 1, *t.shape))
+        values[0] = 1.0
+        for k in range(1, self.degree + 1):
+            # values[r] becomes b_k(t + k - r), coefficient first + r; downwards, as it reads values[r - 1].
+            values[k] = t * values[k - 1] / k
+            for r in range(k - 1, 0, -1):
+                values[r] = ((t + (k - r)) * values[r - 1] + (1 + r - t) * values[r]) / k
+            values[0] *= (1 - t) / k
+        return first, values
+
+    def row(self, u: float) -> Array:
+        """Values of all K basis functions at one angle sum, shape (K,)."""
+        first, values = self.basis(np.array([u]))
+        row = np.zeros(self.size)
+        row[first[0] : first[0] + self.degree + 1] = values[:, 0]
+        return row
+
+    def peak(self, coefficients: ArrayLike) -> float:
+        """Angle sum of the largest value among 8 samples a knot interval, in radians."""
+        u = np.linspace(self.start, self.stop, 8 * self.intervals + 1)
+        return float(u[np.argmax(self.evaluate(coefficients, u))])
+
+    def evaluate(self, coefficients: ArrayLike, u: ArrayLike) -> Array:
+        """rho(u), same shape as u, zero outside the grid."""
+        u = np.asarray(u, dtype=np.float64)
+        first, values = self.basis(u)
+        r = np.asarray(coefficients, dtype=np.float64)
+        total = np.zeros(u.shape)
+        for k in range(self.degree + 1):
+            total += r[first + k] * values[k]
+        return np.where((u >= self.start) & (u <= self.stop), total, 0.0)
+
+
+def grid_for(kernel: Kernel, *, step: float, degree: int) -> SplineGrid:
+    """The grid that covers every angle sum of a kernel."""
+    u = kernel.theta_s + kernel.theta_o
+    return SplineGrid.covering(float(u.min()), float(u.max()), step=step, degree=degree)
+
+
+def design_matrices(kernel: Kernel, grid: SplineGrid) -> list[sp.csr_array]:
+    """T_1 .. T_M, each sparse (P, K) with P = A N, such that F[:, i] = T_i r."""
+    views, pixels, elements, nodes = kernel.weight.shape
+    rows = views * pixels
+    first, values = grid.basis(kernel.angle_sum)
+    order = grid.degree + 1
+    matrices = []
+    for i in range(elements):
+        columns = first[:, :, i].reshape(rows, nodes)
+        weighted = (values[:, :, :, i] * kernel.weight[:, :, i]).reshape(order, rows, nodes)
+        matrices.append(_banded_rows(columns, weighted, grid.size))
+    return matrices
+
+
+def _banded_rows(columns: NDArray[np.intp], weighted: Array, size: int) -> sp.csr_array:
+    """Sum the nodes of each row into one contiguous run of columns; all rows get runs of the same length."""
+    order, rows, nodes = weighted.shape
+    begin = columns.min(axis=1)
+    width = int((columns.max(axis=1) - begin).max()) + order
+    width = min(width, size)
+    begin = np.minimum(begin, size - width)
+    if nodes == 1:
+        data = np.zeros((rows, width))
+        offset = columns[:, 0] - begin
+        if width == order:
+            data[:] = weighted[:, :, 0].T
+        else:
+            data[np.arange(rows)[:, None], offset[:, None] + np.arange(order)] = weighted[:, :, 0].T
+    else:
+        flat = np.zeros(rows * width)
+        base = (np.arange(rows) * width - begin)[:, None] + columns
+        for k in range(order):
+            flat += np.bincount((base + k).ravel(), weights=weighted[k].ravel(), minlength=rows * width)
+        data = flat.reshape(rows, width)
+    indices = (begin[:, None] + np.arange(width)).ravel()
+    pointers = np.arange(rows + 1) * width
+    return sp.csr_array((data.ravel(), indices, pointers), shape=(rows, size))

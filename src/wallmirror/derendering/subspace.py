@@ -1,0 +1,177 @@
+"""The closed form: BRDF and pattern from one small eigenproblem, exact where there is no noise.
+
+The columns of F = [T_1 r .. T_M r] span the same space as the data D = F V, and each T_i is known, so that r
+is the vector that keeps every T_i r in that space. This is the subspace method of blind channel
+identification (Moulines, Duhamel, Cardoso, Mayrargue, IEEE Trans. Signal Processing 43(2), 1995; Xu, Liu,
+Tong, Kailath, ibid. 43(12), 1995), as used for blind gain calibration by Balzano and Nowak (IPSN 2007) and,
+nearest to this field, for Lambertian inverse rendering by Nguyen and Do.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg as sl
+import scipy.sparse as sp
+import scipy.sparse.linalg as spl
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Above this many elements the M^2 x M^2 matrix is not formed; Lanczos finds its two leading pairs.
+_DENSE_ELEMENTS = 16
+_RIDGE = 1e-13
+
+
+@dataclass(frozen=True)
+class SignalSpace:
+    """The leading left singular space of the data.
+
+    Parameters
+    ----------
+    basis:
+        U, shape (P, M), orthonormal.
+    singular_values:
+        All singular values of the data, descending, shape (min(P, B),).
+    rank:
+        How many of them stand out of rounding and noise, at most M.
+    """
+
+    basis: Array
+    singular_values: Array
+    rank: int
+
+
+@dataclass(frozen=True)
+class ClosedForm:
+    """Result of `closed_form`, in the scale in which the rms of F over all entries is that of T r with |T r| = 1.
+
+    Parameters
+    ----------
+    coefficients:
+        r, shape (K,), with the sign that makes its sum positive.
+    transport:
+        F = U W, shape (P, M).
+    source:
+        V = W^-1 U^T D, shape (M, B).
+    mismatch:
+        1 - lambda_1, the share of T r outside the data's space: wrong geometry, too coarse a grid,
+        Hypothesis 8 violated, or noise.
+    gap:
+        1 - lambda_2: how far the second-best BRDF is from explaining the data; 0 means undetermined.
+    near_solutions:
+        Number of orthogonal BRDFs that explain the data as well as the best within a factor of 100.
+    """
+
+    coefficients: Array
+    transport: Array
+    source: Array
+    mismatch: float
+    gap: float
+    near_solutions: int
+    mixing_condition: float
+
+
+def signal_space(data: Array, elements: int, *, noise_floor: float = 0.0) -> SignalSpace:
+    """U and the rank of the data, both from one QR and one small SVD.
+
+    Parameters
+    ----------
+    data:
+        D, shape (P, B), of order one (normalised by the caller).
+    elements:
+        M, the rank that D has when all elements can be told apart.
+    noise_floor:
+        Singular value that noise alone would reach; the rank counts those above it and above rounding.
+    """
+    q, triangle = np.linalg.qr(data)
+    left, values, _ = np.linalg.svd(triangle)
+    rounding = values[0] * np.finfo(np.float64).eps * max(data.shape) if values.size else 0.0
+    rank = int(np.count_nonzero(values[:elements] > max(rounding, noise_floor)))
+    return SignalSpace(q @ left[:, :elements], values, rank)
+
+
+def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) -> ClosedForm:
+    """Recover r, F and V from data whose rank is M (SOLVER: minimise sum_i |(I - U U^T) T_i r|^2).
+
+    Parameters
+    ----------
+    data:
+        D, shape (P, B).
+    designs:
+        T_1 .. T_M, each (P, K).
+    space:
+        `signal_space(data, M)` with rank M.
+
+    Notes
+    -----
+    With H = stack(U^T T_i) and A = sum T_i^T T_i the minimiser under sum |T_i r|^2 = 1 is r = A^-1 H^T q, where
+    q is the leading eigenvector of H A^-1 H^T, whose eigenvalues lie in [0, 1].
+    """
+    u = space.basis
+    size = designs[0].shape[1]
+    stacked = np.concatenate([(t.T @ u).T for t in designs])  # H, (M^2, K); rows i*M..i*M+M-1 belong to T_i
+    factor = _banded_cholesky(sum_of_grams(designs))
+    values, leading = _leading_pairs(stacked, factor, len(designs))
+    r = sl.cho_solve_banded((factor, True), stacked.T @ leading)
+    if r.sum() < 0:
+        r = -r
+    projected = (stacked @ r).reshape(len(designs), -1).T  # W, (M, M): column i is U^T T_i r
+    norm, missed = 0.0, 0.0
+    for i, t in enumerate(designs):
+        column = t @ r
+        # The residual itself: 1 - lambda_1 from the eigenvalue would end at 1e-16, this goes on to its square.
+        missed += float(np.sum((column - u @ projected[:, i]) ** 2))
+        norm += float(column @ column)
+    mismatch = missed / norm if norm > 0 else 1.0
+    scale = 1 / math.sqrt(norm) if norm > 0 else 1.0
+    lost = 1 - values
+    near = int(np.count_nonzero(lost < 100 * max(mismatch, 1e-15 * size)))
+    return ClosedForm(
+        coefficients=r * scale,
+        transport=(u @ projected) * scale,
+        source=np.linalg.solve(projected * scale, u.T @ data),
+        mismatch=mismatch,
+        gap=float(lost[1]) if lost.size > 1 else 1.0,
+        near_solutions=max(1, near),
+        mixing_condition=float(np.linalg.cond(projected)),
+    )
+
+
+def sum_of_grams(designs: list[sp.csr_array]) -> sp.csr_array:
+    """A = sum_i T_i^T T_i, sparse (K, K)."""
+    stacked = sp.vstack(designs, format="csr")
+    return sp.csr_array(stacked.T @ stacked)
+
+
+def _banded_cholesky(gram: sp.csr_array) -> Array:
+    """Lower banded Cholesky factor of A plus a ridge that only cells without data feel."""
+    coo = gram.tocoo()
+    row, column = coo.coords
+    bandwidth = int(np.max(np.abs(row - column), initial=0))
+    band = np.zeros((bandwidth + 1, gram.shape[0]))
+    lower = row >= column
+    band[(row - column)[lower], column[lower]] = coo.data[lower]
+    band[0] += _RIDGE * band[0].max()
+    return np.asarray(sl.cholesky_banded(band, lower=True), dtype=np.float64)
+
+
+def _leading_pairs(stacked: Array, factor: Array, elements: int) -> tuple[Array, Array]:
+    """Eigenvalues of H A^-1 H^T, descending (all of them, or the first four), and the first eigenvector."""
+
+    def apply(x: Any) -> Array:
+        return np.asarray(stacked @ sl.cho_solve_banded((factor, True), stacked.T @ x), dtype=np.float64)
+
+    n = stacked.shape[0]
+    if elements <= _DENSE_ELEMENTS:
+        matrix = apply(np.eye(n))
+        values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+        return values[::-1], vectors[:, -1]
+    operator = spl.LinearOperator((n, n), matvec=apply, dtype=np.float64)
+    start = np.random.default_rng(0).standard_normal(n)
+    values, vectors = spl.eigsh(operator, k=4, which="LA", v0=start, tol=1e-14)
+    order = np.argsort(values)[::-1]
+    return values[order], vectors[:, order[0]]

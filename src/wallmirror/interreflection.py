@@ -1,0 +1,205 @@
+"""The light that Hypothesis 2 leaves out: what a reflective card or a room sends back to the wall.
+
+One bounce is all there is only if nothing but the wall reflects. Here the next bounces are computed from the known
+geometry, the albedos of card and room, and a BRDF of the angle sum, so that the bias of a one-bounce solution can be
+predicted before anybody believes it; the residual of the fit cannot show it.
+
+Card and wall are parallel, so the angles depend on x alone and the integral over the wall's height closes. With
+A, B the in-plane distances of two card points from a wall point, z the distance of the planes, d the card points'
+difference in height, c = A + B (the wall taken as infinitely high):
+
+    int z^2/(A^2 + h^2)^2 z^2/(B^2 + (h - d)^2)^2 dh = z^4 pi/(4 A^3 B^3) [ c/(c^2+d^2) + c (c^2-d^2)/(c^2+d^2)^2
+                                                     + 2 A B (c^3 - 3 c d^2)/(c^2+d^2)^3 ].
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wallmirror.brdf import AngleSumBRDF
+from wallmirror.geometry import Card, Observer, outgoing_angles, pixel_tangents, wall_points
+from wallmirror.scene import Room
+from wallmirror.transport import build_kernel
+
+Array = NDArray[np.float64]
+
+_COLUMNS = 24
+_ROWS = 4
+_WALL_NODES = 1500
+
+
+def directional_albedo(brdf: AngleSumBRDF, incidence: float = 0.0) -> float:
+    """Share of light from one in-plane direction (radians) that the wall reflects: (pi/2) int rho cos theta_o.
+
+    Examples
+    --------
+    >>> from wallmirror.brdf import Diffuse
+    >>> round(directional_albedo(Diffuse(albedo=0.5)), 6)
+    0.5
+    """
+    edges = np.linspace(-math.pi / 2, math.pi / 2, 7201)
+    theta = 0.5 * (edges[1:] + edges[:-1])
+    return float(math.pi / 2 * np.sum(brdf.of_sum(incidence + theta) * np.cos(theta)) * (edges[1] - edges[0]))
+
+
+def from_card(observer: Observer, card: Card, brdf: AngleSumBRDF, source: Array) -> Array:
+    """Radiance that the camera receives from light that the card has reflected at least once, (A, N, B).
+
+    Parameters
+    ----------
+    card:
+        With albedo and board; strips stand on the board.
+    brdf:
+        In 1/sr, its absolute scale counts here.
+    source:
+        V, shape (M, B).
+    """
+    width = card.board_width or (max(card.elements_x) - min(card.elements_x) + card.element_width)
+    height = card.board_height or card.element_height
+    shape = (observer.views, observer.pixels, source.shape[1])
+    if card.albedo == 0 or card.is_points or width <= 0 or height <= 0:
+        return np.zeros(shape)
+    middle = 0.5 * (max(card.elements_x) + min(card.elements_x)) if not card.board_width else 0.0
+    pitch = width / _COLUMNS
+    columns = middle + (np.arange(_COLUMNS) + 0.5) * pitch - width / 2
+    nodes, shares = np.polynomial.legendre.leggauss(_ROWS)
+    rows, shares = nodes * height / 2, shares / 2
+    x = np.repeat(columns, _ROWS)
+    h = np.tile(rows, _COLUMNS)
+    area = pitch * height * np.tile(shares, _COLUMNS)
+    strips = np.asarray(card.elements_x)
+    strip_area = card.element_width * card.element_height
+    # Irradiance at node q per radiance of source s, both through one reflection on the wall.
+    among = _through_wall(x, h, x, h, card.distance, brdf) * area
+    from_strips = _through_wall(x, h, strips, np.zeros(strips.size), card.distance, brdf) * strip_area
+    back = card.albedo / math.pi
+    reflected = np.linalg.solve(np.eye(x.size) - back * among, back * from_strips @ source)
+    profile = np.tensordot(shares, reflected.reshape(_COLUMNS, _ROWS, -1), axes=(0, 1))
+    board = Card(elements_x=tuple(columns), y=card.y, element_width=pitch * (1 - 1e-9), element_height=height)
+    kernel = build_kernel(observer, board, resolution=brdf.angular_scale, tolerance=1e-3)
+    return np.asarray(kernel.apply(brdf) @ profile, dtype=np.float64)
+
+
+def _through_wall(x_q: Array, h_q: Array, x_s: Array, h_s: Array, z: float, brdf: AngleSumBRDF) -> Array:
+    """int rho cos^2 cos^2 / (r^2 r^2) dA over the wall for each pair of card points, (Q, S), in 1/m^2."""
+    middle = 0.5 * (x_q.min() + x_q.max())
+    edges = np.linspace(-math.pi / 2, math.pi / 2, _WALL_NODES + 1)
+    phi = 0.5 * (edges[1:] + edges[:-1])
+    wall = middle + z * np.tan(phi)
+    step = z / np.cos(phi) ** 2 * (edges[1] - edges[0])
+    unique_q, q_of = np.unique(x_q, return_inverse=True)
+    unique_s, s_of = np.unique(x_s, return_inverse=True)
+    heights, d_of = np.unique(np.abs(h_q[:, None] - h_s[None, :]).round(12), return_inverse=True)
+    table = np.empty((unique_q.size, unique_s.size, heights.size))
+    for i, xq in enumerate(unique_q):
+        a = np.hypot(z, xq - wall)
+        b = np.hypot(z, unique_s[:, None] - wall)
+        u = np.arctan((xq - wall) / z) + np.arctan((unique_s[:, None] - wall) / z)
+        weight = brdf.of_sum(u) * step * z**4 * math.pi / (4 * a**3 * b**3)
+        c = a + b
+        for k, d in enumerate(heights):
+            s = c * c + d * d
+            bracket = c / s + c * (c * c - d * d) / s**2 + 2 * a * b * (c**3 - 3 * c * d * d) / s**3
+            table[i, :, k] = np.sum(weight * bracket, axis=-1)
+    return np.asarray(table[q_of[:, None], s_of[None, :], d_of.reshape(x_q.size, x_s.size)], dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class _Patches:
+    """Diffuse patches of the room: centres (Q, 3), inward normals (Q, 3), areas (Q,)."""
+
+    centre: Array
+    normal: Array
+    area: Array
+
+
+def from_room(observer: Observer, card: Card, room: Room, brdf: AngleSumBRDF, source: Array) -> Array:
+    """Radiance that reaches the camera over the room's surfaces and then the wall, (A, N, B); an estimate.
+
+    Strips light the patches directly and over the wall; patches light each other (radiosity) and the wall. Light that
+    meets the wall three times is left out, so the estimate is low by about the wall's albedo squared.
+    """
+    patches = _room_patches(room)
+    strips = np.stack([np.asarray(card.elements_x), np.full(card.elements, card.y), np.zeros(card.elements)], axis=1)
+    strip_area = 1.0 if card.is_points else card.element_width * card.element_height
+    lit = _exchange(patches, strips, np.array([0.0, 1.0, 0.0])) * strip_area
+    lit = lit + _over_wall(patches, strips, strip_area, room, brdf)
+    among = _exchange(patches, patches.centre, patches.normal) * patches.area
+    np.fill_diagonal(among, 0.0)
+    back = room.albedo / math.pi
+    glow = np.linalg.solve(np.eye(patches.area.size) - back * among, back * lit @ source)
+    return _seen_over_wall(observer, patches, glow, brdf)
+
+
+def _room_patches(room: Room) -> _Patches:
+    across, deep, high = 20, 12, 10
+    x = ((np.arange(across) + 0.5) / across * 2 - 1) * room.half_width
+    y = -(np.arange(deep) + 0.5) / deep * room.depth
+    z = ((np.arange(high) + 0.5) / high * 2 - 1) * room.half_height
+    centres, normals, areas = [], [], []
+    for sign in (-1.0, 1.0):
+        gx, gy = (g.ravel() for g in np.meshgrid(x, y, indexing="ij"))
+        centres.append(np.stack([gx, gy, np.full(gx.size, sign * room.half_height)], axis=1))
+        normals.append(np.tile([0.0, 0.0, -sign], (gx.size, 1)))
+        areas.append(np.full(gx.size, 2 * room.half_width / across * room.depth / deep))
+        gz, gy = (g.ravel() for g in np.meshgrid(z, y, indexing="ij"))
+        centres.append(np.stack([np.full(gz.size, sign * room.half_width), gy, gz], axis=1))
+        normals.append(np.tile([-sign, 0.0, 0.0], (gz.size, 1)))
+        areas.append(np.full(gz.size, 2 * room.half_height / high * room.depth / deep))
+    return _Patches(np.concatenate(centres), np.concatenate(normals), np.concatenate(areas))
+
+
+def _exchange(patches: _Patches, points: Array, normals: Array) -> Array:
+    """cos cos / r^2 from each point (S, 3) with its normal to each patch, (Q, S), in 1/m^2."""
+    ray = points[None, :, :] - patches.centre[:, None, :]
+    square = np.maximum(np.sum(ray * ray, axis=-1), 1e-12)
+    at_patch = np.maximum(np.einsum("qsk,qk->qs", ray, patches.normal), 0.0)
+    at_point = np.maximum(-np.sum(ray * np.broadcast_to(normals, points.shape)[None], axis=-1), 0.0)
+    return np.asarray(at_patch * at_point / square**2, dtype=np.float64)
+
+
+def _over_wall(patches: _Patches, strips: Array, strip_area: float, room: Room, brdf: AngleSumBRDF) -> Array:
+    """Irradiance at each patch per radiance of each strip over one reflection on the wall, (Q, M)."""
+    across, high = 160, 16
+    x = ((np.arange(across) + 0.5) / across * 2 - 1) * room.half_width
+    z = ((np.arange(high) + 0.5) / high * 2 - 1) * room.half_height
+    gx, gz = (g.ravel() for g in np.meshgrid(x, z, indexing="ij"))
+    wall = np.stack([gx, np.zeros(gx.size), gz], axis=1)
+    cell = 4 * room.half_width * room.half_height / gx.size
+    to_patch = _exchange(patches, wall, np.array([0.0, -1.0, 0.0])) * cell
+    theta_q = np.arctan2(patches.centre[:, None, 0] - gx, -patches.centre[:, None, 1])
+    total = np.empty((patches.area.size, strips.shape[0]))
+    for i, (x_s, y_s, z_s) in enumerate(strips):
+        square = (x_s - gx) ** 2 + y_s**2 + (z_s - gz) ** 2
+        irradiance = y_s**2 / square**2 * strip_area
+        rho = brdf.of_sum(np.arctan2(x_s - gx, -y_s) + theta_q)
+        total[:, i] = np.sum(to_patch * rho * irradiance, axis=1)
+    return total
+
+
+def _seen_over_wall(observer: Observer, patches: _Patches, glow: Array, brdf: AngleSumBRDF) -> Array:
+    """Radiance of the wall lit by glowing patches (Q, B), (A, N, B); smooth, so computed on every tenth pixel."""
+    count = max(2, observer.pixels // 10)
+    t = pixel_tangents(observer)
+    coarse = np.linspace(t[0], t[-1], count)
+    x = wall_points(replace(observer, pixels_at="centres"), coarse)
+    theta_o = outgoing_angles(observer, x)
+    seen = np.empty((observer.views, count, glow.shape[1]))
+    centre = patches.centre
+    for a in range(observer.views):
+        dx = centre[:, 0] - x[a][:, None]
+        square = dx**2 + centre[:, 1] ** 2 + centre[:, 2] ** 2
+        wall_point = np.stack([x[a], np.zeros(count), np.zeros(count)], axis=1)
+        facing = np.maximum(np.einsum("nqk,qk->nq", wall_point[:, None, :] - centre, patches.normal), 0.0)
+        theta_s = np.arctan2(dx, -centre[:, 1])
+        rho = brdf.of_sum(theta_s + theta_o[a][:, None])
+        seen[a] = (rho * -centre[:, 1] * facing / square**2 * patches.area) @ glow
+    result = np.empty((observer.views, observer.pixels, glow.shape[1]))
+    for a in range(observer.views):
+        for b in range(glow.shape[1]):
+            result[a, :, b] = np.interp(t, coarse, seen[a, :, b])
+    return result
