@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +23,7 @@ def read_toml(path: Path) -> Fields:
         raise InputError(f"cannot be read as UTF-8 text ({error})", file=path) from None
     try:
         return Fields(tomllib.loads(text), file=path)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # a number of 5000 digits or 5000 nested lists are no decode errors
         raise InputError(f"is not valid TOML: {error}", file=path) from None
 
 
@@ -40,6 +41,7 @@ class Fields:
     def __init__(self, table: dict[str, Any], *, file: Path, path: str = "") -> None:
         self._table = table
         self._taken: set[str] = set()
+        self._known: set[str] = set()
         self.file = file
         self.path = path
 
@@ -49,7 +51,15 @@ class Fields:
 
     def has(self, name: str) -> bool:
         """Whether the field is present."""
+        self._known.add(name)
         return name in self._table
+
+    def flag(self, name: str, default: bool) -> bool:
+        """true or false."""
+        value = self._take(name, default)
+        if not isinstance(value, bool):
+            raise self.error(name, f"is {value!r}; give true or false")
+        return value
 
     def number(
         self, name: str, default: float | None = None, *, low: float = -math.inf, high: float = math.inf
@@ -63,7 +73,8 @@ class Fields:
         if isinstance(value, bool) or not isinstance(value, int):
             raise self.error(name, f"is {value!r}; give a whole number")
         if not low <= value <= high:
-            raise self.error(name, f"is {value}; give a whole number from {low} to {high}")
+            shown = value if abs(value) < 10**20 else "huge"
+            raise self.error(name, f"is {shown}; give a whole number from {low} to {high}")
         return value
 
     def numbers(self, name: str, default: Sequence[float] | None = None, *, size: int = 0) -> tuple[float, ...]:
@@ -81,6 +92,10 @@ class Fields:
         if not isinstance(value, str):
             raise self.error(name, f"is {value!r}; give a text in quotes")
         return value
+
+    def texts(self) -> dict[str, str]:
+        """All entries of a free-form table of strings."""
+        return {name: self.text(name) for name in self._table}
 
     def choice(self, name: str, options: Sequence[str], default: str | None = None) -> str:
         """One of a few strings."""
@@ -117,8 +132,9 @@ class Fields:
         """Refuse the fields that nobody took, with the nearest known name."""
         for name in self._table:
             if name not in self._taken:
-                near = difflib.get_close_matches(name, self._taken, n=1)
-                hint = f'; did you mean "{near[0]}"?' if near else f"; known here: {', '.join(sorted(self._taken))}"
+                known = self._taken | self._known
+                near = difflib.get_close_matches(name, known, n=1)
+                hint = f'; did you mean "{near[0]}"?' if near else f"; known here: {', '.join(sorted(known))}"
                 raise self.error(name, f"is not a known field{hint}")
 
     def _take(self, name: str, default: Any) -> Any:
@@ -130,8 +146,12 @@ class Fields:
         return default
 
     def _as_number(self, name: str, value: Any, low: float, high: float) -> float:
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise self.error(name, f"holds {value!r}; give finite numbers")
+        if not abs(value) <= sys.float_info.max:  # NaN, infinity, and integers that no float can hold
+            raise self.error(
+                name, f"holds {value if isinstance(value, float) else 'a huge number'}; give finite numbers"
+            )
         if not low <= value <= high:
             raise self.error(name, f"is {value:g}; give a number from {low:g} to {high:g}")
         return float(value)

@@ -240,7 +240,7 @@ _MODELS: dict[str, Callable[[Fields], BRDF]] = {
 
 
 def _source(fields: Fields, card: Card) -> Array:
-    """V of shape (M, B): either `patterns` (one list of M radiances a realisation) or `realisations` drawn at random."""
+    """V of shape (M, B): `patterns` (one list of M radiances a realisation) or random `realisations`."""
     level = fields.number("level", 1.0, low=0.0)
     if fields.has("patterns"):
         rows = fields.rows("patterns")
