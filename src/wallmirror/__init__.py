@@ -1,1 +1,80 @@
-"""wallmirror: turn a wall into a mirror."""
+"""wallmirror: turn a wall into a mirror.
+
+From light that a wall sends back, recover the wall's BRDF and the pattern of the hidden card that lights it.
+The core (this namespace) needs NumPy and SciPy; `wallmirror.pathtracing` adds Mitsuba 3 as camera and judge.
+"""
+
+from wallmirror.brdf import (
+    BRDF,
+    AngleSumBRDF,
+    AngleSumTable,
+    Diffuse,
+    GaussianTrain,
+    Mirror,
+    Phong,
+    Sum,
+    Table,
+    tabulate,
+)
+from wallmirror.captures import CaptureSet, Truth, read_captures, read_truth, write_captures
+from wallmirror.comparison import BiasTest, Comparison, compare
+from wallmirror.derendering.estimate import scale_free_error
+from wallmirror.derendering.solution import Solution
+from wallmirror.derendering.solve import solve
+from wallmirror.errors import InputError, MissingRuntimeError, UndeterminedError, WallmirrorError
+from wallmirror.geometry import Card, Observer, scan_angles, wall_points
+from wallmirror.scene import RenderSettings, Room, Scene, Wall, load_scene, scene_names
+from wallmirror.transport import (
+    Kernel,
+    brdf_matrices,
+    build_kernel,
+    mirror_matrix,
+    radiance,
+    transport_matrix,
+)
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "BRDF",
+    "AngleSumBRDF",
+    "AngleSumTable",
+    "BiasTest",
+    "CaptureSet",
+    "Card",
+    "Comparison",
+    "Diffuse",
+    "GaussianTrain",
+    "InputError",
+    "Kernel",
+    "Mirror",
+    "MissingRuntimeError",
+    "Observer",
+    "Phong",
+    "RenderSettings",
+    "Room",
+    "Scene",
+    "Solution",
+    "Sum",
+    "Table",
+    "Truth",
+    "UndeterminedError",
+    "Wall",
+    "WallmirrorError",
+    "brdf_matrices",
+    "build_kernel",
+    "compare",
+    "load_scene",
+    "mirror_matrix",
+    "radiance",
+    "read_captures",
+    "read_truth",
+    "scale_free_error",
+    "scan_angles",
+    "scene_names",
+    "solve",
+    "tabulate",
+    "transport_matrix",
+    "wall_points",
+    "write_captures",
+]

@@ -223,16 +223,14 @@ class Table(BRDF):
 
     def __call__(self, theta_s: ArrayLike, theta_o: ArrayLike) -> Array:
         """Value in 1/sr, broadcast over two arrays of angles in radians."""
-        (i, f), (j, g) = (
-            _cell(theta, size) for theta, size in zip((theta_s, theta_o), self.values.shape, strict=True)
-        )
+        (i, f), (j, g) = (_cell(theta, size) for theta, size in zip((theta_s, theta_o), self.values.shape, strict=True))
         v = self.values
         return (1 - f) * ((1 - g) * v[i, j] + g * v[i, j + 1]) + f * ((1 - g) * v[i + 1, j] + g * v[i + 1, j + 1])
 
     @property
     def angular_scale(self) -> float:
         """Spacing of the finer axis in radians."""
-        return math.pi / (max(self.values.shape) - 1)
+        return math.pi / float(max(self.values.shape) - 1)
 
 
 @dataclass(frozen=True, kw_only=True)

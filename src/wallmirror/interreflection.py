@@ -80,7 +80,9 @@ def from_card(observer: Observer, card: Card, brdf: AngleSumBRDF, source: Array)
     reflected = np.linalg.solve(np.eye(x.size) - back * among, back * from_strips @ source)
     profile = np.tensordot(shares, reflected.reshape(_COLUMNS, _ROWS, -1), axes=(0, 1))
     board = Card(elements_x=tuple(columns), y=card.y, element_width=pitch * (1 - 1e-9), element_height=height)
-    kernel = build_kernel(observer, board, resolution=brdf.angular_scale, tolerance=1e-3)
+    # A glowing board blurs whatever is finer than its columns.
+    scale = max(brdf.angular_scale, math.atan(pitch / card.distance) / 4)
+    kernel = build_kernel(observer, board, resolution=scale, tolerance=1e-2)
     return np.asarray(kernel.apply(brdf) @ profile, dtype=np.float64)
 
 
@@ -132,7 +134,7 @@ def from_room(observer: Observer, card: Card, room: Room, brdf: AngleSumBRDF, so
     np.fill_diagonal(among, 0.0)
     back = room.albedo / math.pi
     glow = np.linalg.solve(np.eye(patches.area.size) - back * among, back * lit @ source)
-    return _seen_over_wall(observer, patches, glow, brdf)
+    return _seen_over_wall(observer, patches, np.asarray(glow, dtype=np.float64), brdf)
 
 
 def _room_patches(room: Room) -> _Patches:

@@ -12,7 +12,7 @@ Gauss-Newton step eliminates V (variable projection; Golub and Pereyra, SIAM J. 
     S dr = sum_b J_b^T W e_b - C_b^T H_b^-1 F^T W e_b,      dv_b = H_b^-1 (F^T W e_b - C_b dr).
 
 S is also the Fisher information of r with V eliminated; its null vector is r itself, the global scale.
-Non-negativity is imposed by projected Newton steps (Bertsekas, SIAM J. Control Optim. 20(2), 1982).
+Non-negativity turns each step into a convex quadratic programme, solved by block pivoting.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 
 # Cells whose Fisher information lies this far below the best-seen cell's are left out of the fit.
 _SEEN = 1e-10
+_RIDGE = 1e-12
+_PIVOTS = 20
 
 
 @dataclass(frozen=True)
@@ -148,7 +150,6 @@ def maximise(
     data: Moments,
     coefficients: Array,
     *,
-    source: Array | None = None,
     nonnegative: bool = True,
     tolerance: float = 1e-9,
     max_iterations: int = 60,
@@ -159,34 +160,29 @@ def maximise(
     ----------
     coefficients:
         Start of r, shape (K,).
-    source:
-        Start of V, shape (M, B); the best one for `coefficients` when left out.
     nonnegative:
         Keep r >= 0 and V >= 0.
     tolerance:
-        Stop when a full step changes the objective by less than this share of its noise-like part.
+        Stop when a full step promises to change the objective by less than this share.
     """
     seen = data.seen
     r = np.where(seen, coefficients, 0.0)
     if nonnegative:
         r = np.maximum(r, 0.0)
-    v = None if source is None else np.array(source.T)
-    state = _evaluate(data, r, v, nonnegative=nonnegative)
+    state = _evaluate(data, r, None, nonnegative=nonnegative)
+    rounding = 1e-14 * float(np.sum(data.energy))
     for iteration in range(1, max_iterations + 1):
-        dr, dv, slope = _step(data, state, seen, nonnegative=nonnegative)
-        if slope <= tolerance * max(state.objective, 1e-300):
+        dr, slope = _step(data, state, seen, nonnegative=nonnegative)
+        if slope <= tolerance * state.objective + rounding:
             return _fit(state, iteration, converged=True)
         length = 1.0
         while True:
-            r_new, v_new = state.r + length * dr, state.v + length * dv
-            if nonnegative:
-                r_new, v_new = np.maximum(r_new, 0.0), np.maximum(v_new, 0.0)
-            trial = _evaluate(data, r_new, v_new, nonnegative=nonnegative)
+            trial = _evaluate(data, state.r + length * dr, None, nonnegative=nonnegative)
             if trial.objective <= state.objective - 1e-4 * length * slope:
                 break
             length /= 2
             if length < 1e-10:
-                return _fit(state, iteration, converged=slope <= 1e-6 * state.objective)
+                return _fit(state, iteration, converged=slope <= 1e-6 * state.objective + 1e3 * rounding)
         state = trial
     return _fit(state, max_iterations, converged=False)
 
@@ -222,40 +218,63 @@ def _evaluate(data: Moments, r: Array, v: Array | None, *, nonnegative: bool) ->
         ridge = 1e-14 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(m)
         v = np.linalg.solve((normal + ridge)[data.group], moment[..., None])[..., 0]
         if nonnegative:
-            v = np.maximum(v, 0.0)
+            for b in np.flatnonzero(np.any(v < 0, axis=1)):
+                quadratic_b = normal[data.group[b]] + ridge[data.group[b]]
+                v[b] = _step_above(np.zeros(m), quadratic_b, moment[b])
     quadratic = np.einsum("bi,bij,bj->b", v, normal[data.group], v)
     objective = float(np.sum(data.energy - 2 * np.sum(v * moment, axis=1) + quadratic))
     return _State(r, v, normal, pair, objective)
 
 
-def _step(data: Moments, state: _State, seen: NDArray[np.bool_], *, nonnegative: bool) -> tuple[Array, Array, float]:
-    """The (projected) Gauss-Newton step in r and V, and the decrease of the objective that it promises."""
+def _step(data: Moments, state: _State, seen: NDArray[np.bool_], *, nonnegative: bool) -> tuple[Array, float]:
+    """The Gauss-Newton step in r with V eliminated, and the decrease of the objective that it promises."""
     by_group = state.pair[data.group]  # (B, M, M, K)
     residual = data.cross - np.einsum("bijk,bj->bik", by_group, state.v)  # T_i^T W e_b
     grad_r = np.einsum("bi,bik->k", state.v, residual)
     grad_v = residual @ state.r
-    free_r, free_v = seen.copy(), np.ones_like(state.v, dtype=bool)
+    free_v = np.ones_like(state.v, dtype=bool)
     if nonnegative:
-        free_r &= (state.r > 0) | (grad_r > 0)
-        free_v &= (state.v > 0) | (grad_v > 0)
-    cells = np.flatnonzero(free_r)
+        free_v = (state.v > 0) | (grad_v > 0)
+    cells = np.flatnonzero(seen)
+    grad_v = np.where(free_v, grad_v, 0.0)
     schur, inverse, coupled = _schur(data, state, free_v, cells)
-    eliminated = np.einsum("bmk,bm->k", coupled, np.where(free_v, grad_v, 0.0))
-    right = grad_r[cells] - eliminated
+    right = grad_r[cells] - np.einsum("bmk,bm->k", coupled, grad_v)
     r = state.r[cells]
     level = np.trace(schur) / max(1, cells.size)
+    step = np.zeros(cells.size)
     if level > 0:
         # The gauge r r^T keeps the step off the scale's null direction; the ridge is for barely seen cells.
         schur += level * np.outer(r, r) / max(float(r @ r), 1e-300)
-        schur[np.diag_indices_from(schur)] += 1e-12 * level
-        step = sl.solve(schur, right, assume_a="pos")
-    else:
-        step = np.zeros(cells.size)
+        schur[np.diag_indices_from(schur)] += _RIDGE * level
+        step = _step_above(-r, schur, right) if nonnegative else sl.solve(schur, right, assume_a="pos")
     dr = np.zeros_like(state.r)
     dr[cells] = step
-    dv = np.einsum("bij,bj->bi", inverse, np.where(free_v, grad_v, 0.0)) - coupled @ step
-    slope = float(grad_r @ dr + np.sum(grad_v * dv))
-    return dr, dv, slope
+    return dr, float(grad_r @ dr)
+
+
+def _step_above(floor: Array, quadratic: Array, linear: Array) -> Array:
+    """Minimise 1/2 d Q d - q d over d >= floor by block principal pivoting (Judice and Pires 1994).
+
+    All variables on the wrong side of their bound change sides at once, starting from those that lie at their bound
+    now. Should that cycle, the best vector so far, moved into the bounds, is still a direction to search along.
+    """
+    offset = linear - quadratic @ floor  # in x = d - floor >= 0
+    free = (floor < 0) | (linear > 0)
+    best, fewest = np.zeros_like(floor), floor.size + 1
+    slack = 1e-9 * float(np.max(np.abs(offset), initial=0.0))
+    for _ in range(_PIVOTS):
+        x = np.zeros_like(floor)
+        inside = np.flatnonzero(free)
+        if inside.size:
+            x[inside] = sl.solve(quadratic[np.ix_(inside, inside)], offset[inside], assume_a="pos")
+        wrong = np.where(free, x < -1e-12 * np.max(np.abs(x)), quadratic @ x - offset < -slack)
+        count = int(np.count_nonzero(wrong))
+        if count < fewest:
+            best, fewest = x, count
+        if count == 0:
+            break
+        free = free ^ wrong
+    return np.maximum(best, 0.0) + floor
 
 
 def _schur(

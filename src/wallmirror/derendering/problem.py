@@ -51,11 +51,16 @@ class Problem:
 
     @cached_property
     def row_weights(self) -> Array:
-        """Square root of each row's mean inverse variance, shape (P, 1): makes the noise of the rows alike."""
+        """Square root of each row's mean inverse variance, shape (P, 1): makes the noise of the rows alike.
+
+        A row in which one realisation is saturated would break the rank of the data, so it weighs nothing here, as
+        long as half of the rows are left.
+        """
         if self.inverse_variance is None:
             return np.ones((self.data.shape[0], 1))
         weights: Array = np.sqrt(np.mean(self.inverse_variance, axis=1, keepdims=True))
-        return weights
+        whole = np.all(self.inverse_variance > 0, axis=1, keepdims=True)
+        return np.where(whole, weights, 0.0) if 2 * np.count_nonzero(whole) >= whole.size else weights
 
     @cached_property
     def weighted_data(self) -> Array:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wallmirror.derendering.estimate import Estimate
+from wallmirror.derendering.one_bounce import OneBounceCheck
 from wallmirror.derendering.problem import Problem
-from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace
 from wallmirror.errors import UndeterminedError
 
@@ -23,6 +24,8 @@ Verdict = Literal["good", "doubtful"]
 # Error bars beyond this share of the pattern mean that the data do not determine it.
 _UNDETERMINED = 0.5
 _CURVE_NODES = 2401
+# A bias beyond this share of the error bars is told.
+_BIAS_TOLD = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +67,8 @@ class Solution:
         Residual in units of the noise variance per degree of freedom (nan where no variance is known).
     step_deg:
         Knot spacing of the BRDF's spline in degrees.
+    one_bounce:
+        What light beyond one bounce would do to this solution; None where nothing but the wall reflects.
     seconds:
         Time the solver took.
     """
@@ -88,6 +93,7 @@ class Solution:
     residual: float
     chi_squared: float
     step_deg: float
+    one_bounce: OneBounceCheck | None
     seconds: float
 
     def summary(self) -> dict[str, Any]:
@@ -114,6 +120,7 @@ class Solution:
         return {
             **{k: _finite(v) for k, v in scalars.items()},
             "warnings": list(self.warnings),
+            "one_bounce": None if self.one_bounce is None else asdict(self.one_bounce),
             "gauge": "max rho = 1",
             "source": _finite(self.source.tolist()),
             "source_std": _finite(self.source_std.tolist()),
@@ -124,36 +131,14 @@ class Solution:
         return json.dumps(self.summary(), indent=2, allow_nan=False)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Estimate:
-    """What one method found, in the solver's own scale and before it is judged.
-
-    Parameters
-    ----------
-    closed:
-        The closed form that it is or that it started from, with its certificates.
-    coefficients, source, transport:
-        r (K,), V (M, B), F (P, M) with F V = D / scale.
-    source_std:
-        Standard deviation of V, shape (M, B), in the gauge where the BRDF's peak is held fixed.
-    brdf_std:
-        Standard deviation of rho at given angle sums.
-    """
-
-    method: str
-    grid: SplineGrid
-    closed: ClosedForm
-    coefficients: Array
-    source: Array
-    transport: Array
-    source_std: Array
-    brdf_std: Callable[[Array], Array]
-    predicted_error: float
-    chi_squared: float
-    warnings: tuple[str, ...]
-
-
-def conclude(problem: Problem, space: SignalSpace, estimate: Estimate, *, seconds: Callable[[], float]) -> Solution:
+def conclude(
+    problem: Problem,
+    space: SignalSpace,
+    estimate: Estimate,
+    one_bounce: OneBounceCheck | None,
+    *,
+    seconds: Callable[[], float],
+) -> Solution:
     """Put an estimate into the gauge max rho = 1, attach its certificates and say in words how far to trust it.
 
     Raises
@@ -185,6 +170,14 @@ def conclude(problem: Problem, space: SignalSpace, estimate: Estimate, *, second
             f"the closed form misses the data's space by {closed.mismatch:.1e} where noise explains {expected:.1e}, so "
             "the geometry, Hypothesis 2 (one bounce) or Hypothesis 8 (angle sum) does not hold"
         )
+    if one_bounce is not None and one_bounce.bias > _BIAS_TOLD * estimate.predicted_error:
+        basis = "assumed" if one_bounce.assumed else "given"
+        warnings.insert(
+            0,
+            f"Hypothesis 2 (one bounce) does not hold: card or room send back {100 * one_bounce.share:.2g} % more light, "
+            f"which turns the pattern by about {100 * one_bounce.bias:.2g} % (at the {basis} wall albedo of "
+            f"{one_bounce.wall_albedo:.2g}) and does not show in the residual",
+        )
     return Solution(
         status=_status(problem, estimate, warnings),
         verdict="doubtful" if warnings else "good",
@@ -206,6 +199,7 @@ def conclude(problem: Problem, space: SignalSpace, estimate: Estimate, *, second
         residual=float(missed / np.linalg.norm(problem.data)),
         chi_squared=estimate.chi_squared,
         step_deg=math.degrees(grid.step),
+        one_bounce=one_bounce,
         seconds=seconds(),
     )
 
@@ -237,19 +231,6 @@ def _status(problem: Problem, estimate: Estimate, warnings: list[str]) -> str:
         return f"{found} No certificate objects."
     more = f" ({len(warnings) - 1} more warning{'s' if len(warnings) > 2 else ''}.)" if len(warnings) > 1 else ""
     return f"{found} But {warnings[0]}.{more}"
-
-
-def scale_free_error(estimate: Array, truth: Array) -> float:
-    """Relative Frobenius error after the best global scale of the estimate.
-
-    Examples
-    --------
-    >>> scale_free_error(np.array([2.0, 4.0]), np.array([1.0, 2.0]))
-    0.0
-    """
-    power = float(np.sum(estimate * estimate))
-    scale = float(np.sum(estimate * truth)) / power if power > 0 else 0.0
-    return float(np.linalg.norm(scale * estimate - truth) / np.linalg.norm(truth))
 
 
 def _finite(value: Any) -> Any:

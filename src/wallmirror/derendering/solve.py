@@ -12,13 +12,16 @@ from collections.abc import Callable
 from typing import Literal, get_args
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.bounds import cramer_rao
+from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.likelihood import Fit, Moments, maximise, moments
+from wallmirror.derendering.one_bounce import check_one_bounce
 from wallmirror.derendering.problem import Problem, prepare
-from wallmirror.derendering.solution import Estimate, Solution, conclude
+from wallmirror.derendering.solution import Solution, conclude
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form
 from wallmirror.errors import InputError
@@ -42,6 +45,7 @@ def solve(
     method: Method = "auto",
     nonnegative: bool = True,
     step_deg: float | None = None,
+    wall_albedo: float | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Solution:
     """Recover the card's pattern and the wall's BRDF together from a capture set.
@@ -57,6 +61,9 @@ def solve(
         Keep rho >= 0 and V >= 0 in the maximum likelihood fit.
     step_deg:
         Knot spacing of the BRDF in degrees; chosen by the data when left out.
+    wall_albedo:
+        The wall's directional albedo at normal incidence, if known: sets the scale of the check of Hypothesis 2, which
+        runs where card or room reflect.
     progress:
         Called with a sentence at each stage.
 
@@ -71,6 +78,8 @@ def solve(
         raise InputError(f'is "{method}"; choose one of {", ".join(get_args(Method))}', field="method")
     if step_deg is not None and not 0.001 <= step_deg <= 45:
         raise InputError(f"is {step_deg:g}; give a knot spacing from 0.001 to 45 degrees", field="step_deg")
+    if wall_albedo is not None and not 0 < wall_albedo <= 1:
+        raise InputError(f"is {wall_albedo:g}; an albedo lies between 0 and 1", field="wall_albedo")
     started = time.perf_counter()
     tell = progress or (lambda _: None)
     problem, space = prepare(captures)
@@ -83,25 +92,26 @@ def solve(
     if estimate is None:
         tell("maximum likelihood")
         estimate = _maximum_likelihood(problem, space, (step_deg,) if step_deg else _NOISY_STEPS, nonnegative, tell)
-    return conclude(problem, space, estimate, seconds=lambda: time.perf_counter() - started)
+    check = check_one_bounce(problem, estimate, wall_albedo=wall_albedo)
+    return conclude(problem, space, estimate, check, seconds=lambda: time.perf_counter() - started)
 
 
 def _closed_form(problem: Problem, space: SignalSpace, steps: tuple[float, ...]) -> Estimate:
     """Quarter the knot spacing while the mismatch falls to a third, then try the spacing halfway."""
 
-    def at(step: float) -> tuple[SplineGrid, ClosedForm]:
+    def at(step: float) -> tuple[SplineGrid, ClosedForm, list[sp.csr_array]]:
         grid, designs = problem.designs(step, degree=_EXACT_DEGREE, tolerance=1e-9)
-        return grid, closed_form(problem.weighted_data, problem.weighted(designs), space)
+        return grid, closed_form(problem.weighted_data, problem.weighted(designs), space), designs
 
-    grid, closed = at(steps[0])
+    grid, closed, designs = at(steps[0])
     for step in steps[1:]:
         finer = at(step)
         if finer[1].mismatch > closed.mismatch / 3:
             halfway = at(2 * step)
             if halfway[1].mismatch < closed.mismatch / 3:
-                grid, closed = halfway
+                grid, closed, designs = halfway
             break
-        grid, closed = finer
+        grid, closed, designs = finer
     warnings: tuple[str, ...] = ()
     if closed.mismatch > 1e-8:
         warnings = (
@@ -110,13 +120,16 @@ def _closed_form(problem: Problem, space: SignalSpace, steps: tuple[float, ...])
         )
     # The subspace turns by at most sqrt(mismatch) / gap, and with it pattern and BRDF (Davis and Kahan 1970).
     error = math.sqrt(closed.mismatch) / max(closed.gap, 1e-300) + 1e-15
+    weights = problem.row_weights
+    transport = np.stack([t @ closed.coefficients for t in designs], axis=1)
+    np.divide(closed.transport, weights, out=transport, where=weights > 0)
     return Estimate(
         method="closed_form",
         grid=grid,
         closed=closed,
         coefficients=closed.coefficients,
         source=closed.source,
-        transport=closed.transport / problem.row_weights,
+        transport=transport,
         source_std=np.full(closed.source.shape, error * float(np.sqrt(np.mean(closed.source**2)))),
         brdf_std=lambda u: np.full(u.shape, error * float(np.max(grid.evaluate(closed.coefficients, u)))),
         predicted_error=error,
@@ -144,8 +157,10 @@ def _maximum_likelihood(
         if best is not None:
             variance = fit.objective / max(1, summed.observations - summed.size)
             if best[3].objective - fit.objective < 2 * (summed.size - best[2].size) * variance:
+                # One idle halving ends the search, unless the noise is known and not yet reached.
                 idle += 1
-                if idle == 2:
+                reached = best[3].objective < best[2].observations + 4 * math.sqrt(2 * best[2].observations)
+                if idle == 2 or (reached if problem.noise_is_stated else step < steps[1]):
                     break
                 continue
         best, idle = (grid, closed, summed, fit), 0

@@ -1,0 +1,56 @@
+"""What a method of de-rendering hands to the judge: its estimate, before any gauge or verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wallmirror.derendering.splines import SplineGrid
+from wallmirror.derendering.subspace import ClosedForm
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """What one method found, in the solver's own scale and before it is judged.
+
+    Parameters
+    ----------
+    closed:
+        The closed form that it is or that it started from, with its certificates.
+    coefficients, source, transport:
+        r (K,), V (M, B), F (P, M) with F V = D / scale.
+    source_std:
+        Standard deviation of V, shape (M, B), in the gauge where the BRDF's peak is held fixed.
+    brdf_std:
+        Standard deviation of rho at given angle sums.
+    """
+
+    method: str
+    grid: SplineGrid
+    closed: ClosedForm
+    coefficients: Array
+    source: Array
+    transport: Array
+    source_std: Array
+    brdf_std: Callable[[Array], Array]
+    predicted_error: float
+    chi_squared: float
+    warnings: tuple[str, ...]
+
+
+def scale_free_error(estimate: Array, truth: Array) -> float:
+    """Relative Frobenius error after the best global scale of the estimate.
+
+    Examples
+    --------
+    >>> scale_free_error(np.array([2.0, 4.0]), np.array([1.0, 2.0]))
+    0.0
+    """
+    power = float(np.sum(estimate * estimate))
+    scale = float(np.sum(estimate * truth)) / power if power > 0 else 0.0
+    return float(np.linalg.norm(scale * estimate - truth) / np.linalg.norm(truth))

@@ -1,0 +1,121 @@
+"""Hypothesis 2 before the fact: would light beyond one bounce bias this solution, and by how much?
+
+The residual of a one-bounce fit cannot tell: interreflection is nearly tangent to the one-bounce model, so that
+another pattern explains it. What can tell is the known geometry: the light that card and room send back is computed
+from the recovered BRDF (`interreflection`), added to the model's own data, and solved again; the change of the
+pattern is the bias.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wallmirror.brdf import AngleSumTable
+from wallmirror.captures import CaptureSet
+from wallmirror.derendering.estimate import Estimate, scale_free_error
+from wallmirror.derendering.likelihood import maximise, moments
+from wallmirror.derendering.problem import Problem
+from wallmirror.interreflection import directional_albedo, from_card, from_room
+
+Array = NDArray[np.float64]
+
+# A bias needs no finer spline than this, in degrees.
+_FINEST_DEG = 0.25
+
+#: Wall albedo that is assumed where none is given: a painted wall.
+ASSUMED_ALBEDO = 0.5
+
+
+@dataclass(frozen=True)
+class OneBounceCheck:
+    """What light beyond one bounce would do to a solution.
+
+    Parameters
+    ----------
+    share:
+        Light beyond one bounce over light of one bounce, in the camera.
+    bias:
+        Relative change of the pattern (after the best global scale) that it causes.
+    wall_albedo, assumed:
+        Directional albedo of the wall that sets the BRDF's absolute scale, and whether it was assumed.
+    """
+
+    share: float
+    bias: float
+    wall_albedo: float
+    assumed: bool
+
+
+def beyond_one_bounce(
+    captures: CaptureSet, angle_sum: Array, brdf: Array, source: Array, *, wall_albedo: float
+) -> Array | None:
+    """Radiance beyond one bounce that a recovered BRDF and pattern imply, (A, N, B); None if nothing sends light back.
+
+    Parameters
+    ----------
+    angle_sum, brdf:
+        rho in any scale on nodes in radians, shape (L,).
+    source:
+        V in the scale that makes F V the captures, shape (M, B).
+    wall_albedo:
+        Directional albedo of the wall at normal incidence.
+    """
+    card, room = captures.card, captures.room
+    if (card.albedo == 0 or card.is_points) and (room is None or room.albedo == 0):
+        return None
+    nodes = np.linspace(angle_sum[0], angle_sum[-1], angle_sum.size)
+    values = np.maximum(np.interp(nodes, angle_sum, brdf), 0.0)
+    table = AngleSumTable(start=float(nodes[0]), stop=float(nodes[-1]), values=values)
+    scale = wall_albedo / max(directional_albedo(table), 1e-300)
+    absolute = AngleSumTable(start=table.start, stop=table.stop, values=scale * table.values)
+    level = source / scale
+    extra = np.zeros(captures.radiance.shape)
+    if card.albedo > 0 and not card.is_points:
+        extra += from_card(captures.observer, card, absolute, level)
+    if room is not None:
+        extra += from_room(captures.observer, card, room, absolute, level)
+    return extra
+
+
+def check_one_bounce(
+    problem: Problem, estimate: Estimate, *, wall_albedo: float | None = None
+) -> OneBounceCheck | None:
+    """Predict the bias of a one-bounce estimate; None where nothing but the wall reflects.
+
+    Parameters
+    ----------
+    wall_albedo:
+        Directional albedo of the wall at normal incidence, which sets the scale of the BRDF; 0.5 is assumed when it
+        is left out.
+    """
+    assumed = wall_albedo is None
+    albedo = ASSUMED_ALBEDO if wall_albedo is None else wall_albedo
+    grid = estimate.grid
+    u = np.linspace(grid.start, grid.stop, 8 * grid.intervals + 1)
+    extra = beyond_one_bounce(
+        problem.captures,
+        u,
+        grid.evaluate(estimate.coefficients, u),
+        estimate.source * problem.scale,
+        wall_albedo=albedo,
+    )
+    if extra is None:
+        return None
+    model = estimate.transport @ estimate.source
+    extra = extra.reshape(model.shape) / problem.scale
+    coarse, designs = problem.designs(max(np.degrees(grid.step), _FINEST_DEG), degree=3, tolerance=1e-4)
+    # Schoenberg's approximation, r_k = rho at the middle of phi_k's support, is start enough.
+    start = grid.evaluate(estimate.coefficients, coarse.start + (np.arange(coarse.size) - 1) * coarse.step)
+    sources = []
+    for data in (model, model + extra):
+        summed = moments(data, designs, problem.inverse_variance)
+        sources.append(maximise(summed, start).source)
+    return OneBounceCheck(
+        share=float(np.sum(extra) / np.sum(model)),
+        bias=scale_free_error(sources[1], sources[0]),
+        wall_albedo=albedo,
+        assumed=assumed,
+    )

@@ -1,0 +1,5 @@
+"""Figures and the self-contained report page."""
+
+from wallmirror.report.page import FigureBlock, Section, TableBlock, Verdict, write_page
+
+__all__ = ["FigureBlock", "Section", "TableBlock", "Verdict", "write_page"]

@@ -1,0 +1,220 @@
+"""The figures of a report, each drawn from the numbers of the run that it shows."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon, Rectangle
+from numpy.typing import NDArray
+
+from wallmirror.comparison import Comparison
+from wallmirror.derendering.solution import Solution
+from wallmirror.geometry import Card, Observer
+from wallmirror.scene import Room
+
+Array = NDArray[np.float64]
+
+INK = "#22272e"
+FAINT = "#8b949e"
+TRUTH = "#22272e"
+OURS = "#1664c0"
+WARM = "#c8501e"
+_CYCLE = ("#1664c0", "#c8501e", "#2e8b57", "#8250b4")
+
+
+def _figure(width: float, height: float) -> Figure:
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _clean(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(FAINT)
+    axes.tick_params(colors=INK, labelsize=9)
+
+
+def embed(figure: Figure) -> str:
+    """The figure as the source of an <img>: SVG in base64, nothing to fetch."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None}, dpi=150)
+    return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def scene_plan(observer: Observer, card: Card, *, half_width: float, room: Room | None = None) -> Figure:
+    """The scene from above, to scale: wall, card, observer and the field of view of every view."""
+    figure = _figure(7.2, 4.4)
+    axes = figure.add_subplot()
+    x_o, y_o = observer.position
+    half = observer.fov / 2
+    reach = 0.0
+    for number, angle in enumerate(observer.view_angles):
+        ends = [x_o + y_o * math.tan(angle + side * half) for side in (1, -1)]
+        reach = max(reach, *(abs(e) for e in ends))
+        style: dict[str, Any] = {"alpha": 0.55 / math.sqrt(observer.views), "color": OURS, "linewidth": 0}
+        axes.add_patch(Polygon([(x_o, y_o), (ends[0], 0), (ends[1], 0)], **style))
+        if number in (0, observer.views - 1):
+            axes.plot([ends[0], x_o, ends[1]], [0, y_o, 0], color=OURS, linewidth=0.7, alpha=0.7)
+    span = max(reach, max(abs(x) for x in card.elements_x), room.half_width if room else 0.0)
+    width = min(half_width, 1.12 * span)
+    axes.add_patch(Rectangle((-width, 0), 2 * width, 0.025 * span, color=INK))
+    if room is not None:
+        outline = (
+            [(-room.half_width, 0), (-room.half_width, -room.depth)],
+            [
+                (room.half_width, 0),
+                (room.half_width, -room.depth),
+            ],
+        )
+        for side in outline:
+            axes.plot(*zip(*side, strict=True), color=INK, linewidth=2)
+        axes.annotate(
+            f"room, albedo {room.albedo:g}", (-room.half_width, -0.92 * room.depth), (6, 0),
+            textcoords="offset points", fontsize=9, color=INK,
+        )  # fmt: skip
+    if card.board_width:
+        axes.plot([-card.board_width / 2, card.board_width / 2], [card.y] * 2, color=FAINT, linewidth=3)
+    axes.scatter(card.elements_x, [card.y] * card.elements, color=WARM, s=28, zorder=3)
+    axes.scatter([x_o], [y_o], color=OURS, s=60, marker="^", zorder=3)
+    label: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9, "color": INK}
+    axes.annotate("wall", (0, 0.025 * span), (0, 4), ha="center", **label)
+    axes.annotate(f"hidden card, {card.elements} elements", (max(card.elements_x), card.y), (9, -3), ha="left", **label)
+    axes.annotate(
+        f"camera, {observer.views} views of {math.degrees(observer.fov):.0f}°", (x_o, y_o), (10, -4), ha="left", **label
+    )
+    axes.set_aspect("equal")
+    axes.set_xlabel("x (m)")
+    axes.set_ylabel("y (m)")
+    lowest = -room.depth if room else min(y_o, card.y)
+    axes.set_ylim(lowest - 0.08 * span, 0.13 * span)
+    _clean(axes)
+    return figure
+
+
+def photograph(image: Array, *, caption: str = "") -> Figure:
+    """A 2-D render with the tone curve of a display (sRGB); the brightest half per cent is clipped."""
+    height, width = image.shape[:2]
+    figure = _figure(7.2, 7.2 * height / width)
+    axes = figure.add_subplot()
+    top = float(np.quantile(image, 0.995)) or 1.0
+    tone = np.clip(image / top, 0, 1)
+    tone = np.where(tone <= 0.0031308, 12.92 * tone, 1.055 * np.power(tone, 1 / 2.4) - 0.055)
+    axes.imshow(tone, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    axes.set_axis_off()
+    if caption:
+        axes.set_title(caption, fontsize=10, color=INK)
+    return figure
+
+
+def radiance_maps(reference: Array, mean: Array, comparison: Comparison, *, unit: str = "") -> Figure:
+    """Analytic picture, path-traced picture and their difference in standard errors, views over pixels."""
+    figure = _figure(10.5, 3.1)
+    panels = figure.subplots(1, 3, sharey=True)
+    top = float(np.quantile(reference, 0.999)) or 1.0
+    extent = (0.5, reference.shape[1] + 0.5, reference.shape[0] + 0.5, 0.5)
+    for axes, picture, title in zip(panels[:2], (reference, mean), ("analytic", "Mitsuba 3"), strict=True):
+        shown = axes.imshow(picture, aspect="auto", cmap="inferno", vmin=0, vmax=top, extent=extent,
+                            interpolation="nearest")  # fmt: skip
+        axes.set_title(title, fontsize=10)
+    figure.colorbar(shown, ax=panels[:2], label=f"radiance{unit}", pad=0.01)
+    left_out = panels[2]
+    left_out.set_facecolor("#d0d7de")
+    z = left_out.imshow(comparison.z, aspect="auto", cmap="RdBu_r", vmin=-4, vmax=4, extent=extent,
+                        interpolation="nearest")  # fmt: skip
+    left_out.set_title("difference (grey: left out)", fontsize=10)
+    figure.colorbar(z, ax=left_out, label="standard errors", pad=0.02)
+    panels[0].set_ylabel("view")
+    for axes in panels:
+        axes.set_xlabel("pixel")
+        axes.tick_params(labelsize=9)
+    return figure
+
+
+def score_histogram(comparison: Comparison) -> Figure:
+    """Histogram of the z scores over the normal density that noise alone would give."""
+    figure = _figure(4.6, 2.9)
+    axes = figure.add_subplot()
+    z = comparison.z[np.isfinite(comparison.z)]
+    edges = np.linspace(-5, 5, 51)
+    axes.hist(np.clip(z, -5, 5), bins=edges.tolist(), density=True, color=OURS, alpha=0.6, label="pixels")
+    x = np.linspace(-5, 5, 201)
+    axes.plot(x, np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi), color=INK, label="noise alone")
+    axes.set_xlabel("difference (standard errors)")
+    axes.set_yticks([])
+    axes.legend(frameon=False, fontsize=9)
+    _clean(axes)
+    return figure
+
+
+def recovered_source(solution: Solution, truth: Array | None = None) -> Figure:
+    """The pattern of each realisation: recovered with error bars, beside the truth where it is known."""
+    elements, realisations = solution.source.shape
+    shown = min(realisations, 8)
+    columns = min(shown, 4)
+    rows = math.ceil(shown / columns)
+    figure = _figure(10.5, 2.3 * rows + 0.3)
+    panels = np.atleast_1d(figure.subplots(rows, columns, sharey=True, sharex=True, squeeze=False)).ravel()
+    scale = 1.0
+    if truth is not None:
+        scale = float(np.sum(solution.source * truth) / np.sum(solution.source**2))
+    top = scale * float(np.max(solution.source)) if truth is None else float(np.max(truth))
+    place = np.arange(1, elements + 1)
+    for b, axes in enumerate(panels):
+        if b >= shown:
+            axes.set_axis_off()
+            continue
+        if truth is not None:
+            axes.bar(place, truth[:, b] / top, width=0.72, color="#d0d7de", label="true")
+        axes.errorbar(
+            place, scale * solution.source[:, b] / top, yerr=2 * scale * solution.source_std[:, b] / top,
+            fmt="o", color=OURS, markersize=5, capsize=4, label="recovered (±2 σ)",
+        )  # fmt: skip
+        axes.set_title(f"pattern {b + 1}", fontsize=10)
+        axes.set_xticks(place if elements <= 12 else place[:: elements // 8])
+        _clean(axes)
+    panels[0].set_ylabel("radiance / brightest")
+    panels[0].legend(frameon=False, fontsize=8)
+    figure.supxlabel("element of the card", fontsize=10)
+    return figure
+
+
+def recovered_brdf(solution: Solution, truth: Array | None = None) -> Figure:
+    """The BRDF over the angle sum with its 2-sigma band; `truth` is on the solution's own nodes."""
+    figure = _figure(10.5, 3.2)
+    axes = figure.add_subplot()
+    u = np.degrees(solution.angle_sum)
+    seen = np.isfinite(solution.brdf_std) & (solution.brdf_std < 0.5)
+    rho = np.where(seen, solution.brdf, np.nan)
+    band = np.where(seen, 2 * solution.brdf_std, np.nan)
+    axes.fill_between(u, rho - band, rho + band, color=OURS, alpha=0.25, linewidth=0, label="±2 σ")
+    if truth is not None:
+        power = float(np.sum(np.where(seen, truth, 0.0) ** 2))
+        scale = float(np.nansum(rho * truth)) / power if power else 1.0
+        axes.plot(u, scale * truth, color=TRUTH, linewidth=3.2, alpha=0.25, label="true")
+    axes.plot(u, rho, color=OURS, linewidth=1.2, label="recovered")
+    axes.set_xlim(float(u[seen].min()), float(u[seen].max()))
+    axes.set_ylim(-0.06, 1.12)
+    axes.set_xlabel("angle sum θs + θo (degrees); 0 is the mirror direction")
+    axes.set_ylabel("BRDF / peak")
+    axes.legend(frameon=False, fontsize=9, ncols=3, loc="upper right")
+    _clean(axes)
+    return figure
+
+
+def error_bars(rows: list[tuple[str, float, float]]) -> Figure:
+    """Measured error beside predicted error of the pattern for several solutions, on a log axis."""
+    figure = _figure(7.2, 0.55 * len(rows) + 1.1)
+    axes = figure.add_subplot()
+    place = np.arange(len(rows))[::-1]
+    axes.barh(place + 0.18, [100 * r[1] for r in rows], height=0.34, color=OURS, label="measured")
+    axes.barh(place - 0.18, [100 * r[2] for r in rows], height=0.34, color="#afb8c1", label="its own error bars say")
+    axes.set_yticks(place, [r[0] for r in rows], fontsize=9)
+    axes.set_xscale("log")
+    axes.set_xlabel("error of the pattern (%)")
+    axes.legend(frameon=False, fontsize=9, loc="lower right")
+    _clean(axes)
+    return figure
