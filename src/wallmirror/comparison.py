@@ -163,10 +163,10 @@ def compare(
     brightest = float(reference.max())
     no_edges = np.ones(reference.shape, dtype=bool) if edges is None else ~edges
     bright = reference > _STARVED * brightest
-    keep = bright & no_edges
     deviation = seeds - reference
     scatter = deviation.std(axis=0, ddof=1)
-    exact = bool(np.all(scatter[keep] <= 1e-6 * brightest))
+    exact = bool(np.all(scatter[no_edges] <= 1e-6 * brightest))
+    keep = no_edges if exact else bright & no_edges  # where nothing scatters, darkness is evidence too
     weights = np.where(keep, 1.0 / (reference + 1e-2 * brightest) ** 2, 0.0)
     shapes = {("gain", "of 1"): reference, **(templates or {})}
     biases = tuple(_bias(name, unit, deviation, shape, weights) for (name, unit), shape in shapes.items())
@@ -180,7 +180,7 @@ def compare(
     relative = deviation.mean(axis=0)[keep] / brightest
     if exact:
         # Without scatter there is nothing to test statistically: float32 rounding of a sum of samples remains.
-        passed = bool(np.max(np.abs(relative), initial=0.0) < 1e-5)
+        passed = bool(np.any(bright & keep) and np.max(np.abs(relative)) < 1e-5)
     else:
         level = SIGNIFICANCE / (len(biases) + 2)
         passed = min([largest_p, uniformity, *(b.p_value for b in biases)]) > level
@@ -196,7 +196,7 @@ def compare(
         tile_p=tile_p,
         relative_rms=float(np.sqrt(np.mean(relative**2))) if kept.size else 0.0,
         kept=int(keep.sum()),
-        starved=int((~bright & no_edges).sum()),
+        starved=int((no_edges & ~keep).sum()),
         edges=int((~no_edges).sum()),
         exact=exact,
     )

@@ -79,7 +79,8 @@ def cramer_rao(data: Moments, coefficients: Array, source: Array, *, gauge: Arra
     # Barely seen cells: a ridge far below their neighbours' information keeps their (huge) variance finite.
     ridge = 1e-12 * float(np.trace(schur)) / max(1, schur.shape[0])
     pinned[np.diag_indices_from(pinned)] += ridge
-    covariance = sl.inv(pinned)
+    factor = sl.cho_factor(pinned, lower=True, check_finite=False)
+    covariance = sl.cho_solve(factor, np.eye(pinned.shape[0]), check_finite=False)
     along = float(c @ r)
     if along != 0:
         covariance -= np.outer(r, r) / (strength * along**2)

@@ -8,6 +8,7 @@ pattern is the bias.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,9 +107,8 @@ def check_one_bounce(
         return None
     model = estimate.transport @ estimate.source
     extra = extra.reshape(model.shape) / problem.scale
-    coarse, designs = problem.designs(max(np.degrees(grid.step), _FINEST_DEG), degree=3, tolerance=1e-4)
-    # Schoenberg's approximation, r_k = rho at the middle of phi_k's support, is start enough.
-    start = grid.evaluate(estimate.coefficients, coarse.start + (np.arange(coarse.size) - 1) * coarse.step)
+    coarse, designs = problem.designs(max(math.degrees(grid.step), _FINEST_DEG), degree=3, tolerance=1e-4)
+    start = coarse.interpolate(lambda u: grid.evaluate(estimate.coefficients, u))
     sources = []
     for data in (model, model + extra):
         summed = moments(data, designs, problem.inverse_variance)

@@ -34,6 +34,8 @@ class Problem:
         D / scale, shape (P, B).
     inverse_variance:
         Weights, shape (P, B), 0 for saturated pixels; None for equal weights.
+    noisy:
+        Pixels whose stated variance is their noise, (P, B): neither saturated nor raised to the floor.
     noise_is_stated:
         Whether the weights are inverse variances of all noise, and not only tell which pixels count.
     """
@@ -41,6 +43,7 @@ class Problem:
     captures: CaptureSet
     data: Array
     inverse_variance: Array | None
+    noisy: NDArray[np.bool_]
     noise_is_stated: bool
     scale: float
 
@@ -51,16 +54,20 @@ class Problem:
 
     @cached_property
     def row_weights(self) -> Array:
-        """Square root of each row's mean inverse variance, shape (P, 1): makes the noise of the rows alike.
+        """One over the root of each row's mean variance, shape (P, 1): makes the noise of the rows alike.
 
         A row in which one realisation is saturated would break the rank of the data, so it weighs nothing here, as
         long as half of the rows are left.
         """
         if self.inverse_variance is None:
             return np.ones((self.data.shape[0], 1))
-        weights: Array = np.sqrt(np.mean(self.inverse_variance, axis=1, keepdims=True))
-        whole = np.all(self.inverse_variance > 0, axis=1, keepdims=True)
-        return np.where(whole, weights, 0.0) if 2 * np.count_nonzero(whole) >= whole.size else weights
+        used = self.inverse_variance > 0
+        variance = np.divide(1.0, self.inverse_variance, out=np.zeros_like(self.inverse_variance), where=used)
+        count = np.sum(used, axis=1, keepdims=True)
+        mean = np.sum(variance, axis=1, keepdims=True) / np.maximum(count, 1)
+        whole = count == used.shape[1] if 2 * np.count_nonzero(count == used.shape[1]) >= count.size else count > 0
+        weights: Array = np.divide(1.0, np.sqrt(mean), out=np.zeros_like(mean), where=whole & (mean > 0))
+        return weights
 
     @cached_property
     def weighted_data(self) -> Array:
@@ -115,23 +122,23 @@ def prepare(captures: CaptureSet) -> tuple[Problem, SignalSpace]:
     scale = float(np.abs(data).max(initial=0.0))
     if scale == 0:
         raise UndeterminedError("every capture is dark; light the card and capture again")
-    inverse = None
+    inverse, noisy = None, np.ones(data.shape, dtype=bool)
     if captures.variance is not None:
-        inverse = _inverse_variance(captures.variance.reshape(data.shape) / scale / scale)
+        inverse, noisy = _inverse_variance(captures.variance.reshape(data.shape) / scale / scale)
         if captures.variance_is_floor:
             # Rounding is known, the noise above it is not: all pixels alike, the saturated ones out.
             inverse = None if np.all(inverse > 0) else (inverse > 0).astype(np.float64)
     stated = inverse is not None and not captures.variance_is_floor
-    problem = Problem(captures, data / scale, inverse, stated, scale)
+    problem = Problem(captures, data / scale, inverse, noisy, stated, scale)
     return problem, _signal_space(problem)
 
 
-def _inverse_variance(variance: Array) -> Array:
+def _inverse_variance(variance: Array) -> tuple[Array, NDArray[np.bool_]]:
     finite = np.isfinite(variance)
     if not finite.any():
         raise UndeterminedError("every pixel is saturated; expose for less time and capture again")
     floor = _VARIANCE_FLOOR * float(variance[finite].max()) or 1.0
-    return np.where(finite, 1.0 / np.maximum(variance, floor), 0.0)
+    return np.where(finite, 1.0 / np.maximum(variance, floor), 0.0), finite & (variance > floor)
 
 
 def _signal_space(problem: Problem) -> SignalSpace:

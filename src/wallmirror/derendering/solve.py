@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.bounds import cramer_rao
@@ -82,18 +84,21 @@ def solve(
         raise InputError(f"is {wall_albedo:g}; an albedo lies between 0 and 1", field="wall_albedo")
     started = time.perf_counter()
     tell = progress or (lambda _: None)
-    problem, space = prepare(captures)
-    estimate = None
-    if method != "maximum_likelihood":
-        tell("closed form")
-        exact = _closed_form(problem, space, (step_deg,) if step_deg else _EXACT_STEPS)
-        if method == "closed_form" or exact.closed.mismatch < _NOISELESS:
-            estimate = exact
-    if estimate is None:
-        tell("maximum likelihood")
-        estimate = _maximum_likelihood(problem, space, (step_deg,) if step_deg else _NOISY_STEPS, nonnegative, tell)
-    check = check_one_bounce(problem, estimate, wall_albedo=wall_albedo)
-    return conclude(problem, space, estimate, check, seconds=lambda: time.perf_counter() - started)
+    # The matrices are small: two BLAS threads that wait for each other are up to a hundred times slower than one.
+    with threadpool_limits(limits=1, user_api="blas"):
+        problem, space = prepare(captures)
+        estimate = None
+        if method == "closed_form" or (method == "auto" and not problem.noise_is_stated):
+            tell("closed form")
+            exact = _closed_form(problem, space, (step_deg,) if step_deg else _EXACT_STEPS)
+            if method == "closed_form" or exact.closed.mismatch < _NOISELESS:
+                estimate = exact
+        if estimate is None:
+            tell("maximum likelihood")
+            steps = (step_deg,) if step_deg else _NOISY_STEPS
+            estimate = _maximum_likelihood(problem, space, steps, nonnegative, tell)
+        check = check_one_bounce(problem, estimate, wall_albedo=wall_albedo)
+        return conclude(problem, space, estimate, check, seconds=lambda: time.perf_counter() - started)
 
 
 def _closed_form(problem: Problem, space: SignalSpace, steps: tuple[float, ...]) -> Estimate:
@@ -152,10 +157,13 @@ def _maximum_likelihood(
         grid, designs = problem.designs(step, degree=_NOISY_DEGREE, tolerance=1e-5)
         closed = closed_form(problem.weighted_data, problem.weighted(designs), space)
         summed = moments(problem.data, designs, problem.inverse_variance)
-        fit = maximise(summed, closed.coefficients, nonnegative=nonnegative)
+        starts = [closed.coefficients]
+        if best is not None:
+            starts.append(grid.interpolate(partial(best[0].evaluate, best[3].coefficients)))
+        fit = maximise(summed, *starts, nonnegative=nonnegative)
         tell(f"knots every {step:g} deg: misfit {fit.objective:.6g} after {fit.iterations} steps")
         if best is not None:
-            variance = fit.objective / max(1, summed.observations - summed.size)
+            variance = 1.0 if problem.noise_is_stated else fit.objective / max(1, summed.observations - summed.size)
             if best[3].objective - fit.objective < 2 * (summed.size - best[2].size) * variance:
                 # One idle halving ends the search, unless the noise is known and not yet reached.
                 idle += 1
@@ -167,9 +175,12 @@ def _maximum_likelihood(
     assert best is not None
     grid, closed, summed, fit = best
     _, designs = problem.designs(math.degrees(grid.step), degree=_NOISY_DEGREE, tolerance=1e-5)
-    parameters = int(np.count_nonzero(summed.seen)) + fit.source.size
-    reduced = fit.objective / max(1, summed.observations - parameters)
+    transport = np.stack([t @ fit.coefficients for t in designs], axis=1)
     stated = problem.noise_is_stated
+    weights = problem.inverse_variance if problem.inverse_variance is not None else np.ones(1)
+    counted = np.where(problem.noisy, weights * (problem.data - transport @ fit.source) ** 2, 0.0)
+    parameters = int(np.count_nonzero(summed.seen)) + fit.source.size
+    reduced = float(np.sum(counted)) / max(1, int(np.count_nonzero(problem.noisy)) - parameters)
     # Where the noise is stated, a misfit beyond it widens the bars; where it is not, the misfit is the noise.
     sigma = math.sqrt(max(1.0, reduced) if stated else reduced)
     bound = cramer_rao(summed, fit.coefficients, fit.source, gauge=grid.row(grid.peak(fit.coefficients)))
@@ -187,7 +198,7 @@ def _maximum_likelihood(
         closed=closed,
         coefficients=fit.coefficients,
         source=fit.source,
-        transport=np.stack([t @ fit.coefficients for t in designs], axis=1),
+        transport=transport,
         source_std=sigma * bound.source_std,
         brdf_std=lambda u: sigma * bound.brdf_std(grid, u),
         predicted_error=sigma * bound.source_error,

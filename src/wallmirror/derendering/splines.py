@@ -7,6 +7,7 @@ With rho(u) = sum_k r_k phi_k(u) the transport of each element is linear in r: F
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,6 +71,11 @@ class SplineGrid:
                 values[r] = ((t + (k - r)) * values[r - 1] + (1 + r - t) * values[r]) / k
             values[0] *= (1 - t) / k
         return first, values
+
+    def interpolate(self, function: Callable[[Array], Array]) -> Array:
+        """Coefficients that reproduce a smooth function closely (Schoenberg: its values at the supports' middles)."""
+        middles = self.start + (np.arange(self.size) + 0.5 * (1 - self.degree)) * self.step
+        return function(np.asarray(middles, dtype=np.float64))
 
     def row(self, u: float) -> Array:
         """Values of all K basis functions at one angle sum, shape (K,)."""

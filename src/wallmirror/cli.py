@@ -1,0 +1,183 @@
+"""The command line: a thin skin over public functions; exit 0 good, 1 a verdict failed, 2 bad input, 3 undetermined."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from wallmirror.console import Terminal
+from wallmirror.errors import WallmirrorError
+
+app = typer.Typer(
+    name="wallmirror",
+    help="Turn a wall into a mirror: recover a wall's BRDF and a hidden card's pattern from the light on the wall.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, everything else on stderr.")]
+Seed = Annotated[int, typer.Option(min=0, help="Root of all random numbers.")]
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")]
+
+
+@app.command(epilog="Example: wallmirror demo -o out/demo")
+def demo(out: Out = Path("out/demo"), seed: Seed = 0, as_json: AsJson = False) -> None:
+    """Render, compare and solve three scenes, and leave one page that shows how well it went."""
+    from wallmirror.jobs.demo import run_demo
+
+    terminal = Terminal(as_json=as_json)
+    result = run_demo(out, seed=seed, stage=terminal.progress, tell=terminal.note)
+    rows = []
+    for run in result.runs:
+        solution, judgement = run.solved.solution, run.solved.judgement
+        if judgement is not None:
+            rows.append(
+                [
+                    run.scene.name,
+                    str(run.depth - 1),
+                    f"{100 * judgement.source_error:.2g} %",
+                    f"{100 * solution.predicted_error:.2g} %",
+                    "-" if solution.one_bounce is None else f"{100 * solution.one_bounce.bias:.2g} %",
+                    solution.verdict,
+                ]
+            )
+    terminal.table(["scene", "bounces", "error", "error bars", "bias foretold", "verdict"], rows)
+    gain = result.validation.comparison.gain
+    terminal.say(
+        f"model against Mitsuba: gain - 1 = {gain.estimate:+.1e} ± {gain.standard_error:.0e}, "
+        f"{'not told apart' if result.validation.passed else 'REJECTED'}"
+    )
+    terminal.say(f"{'PASSED' if result.passed else 'FAILED'} in {result.seconds:.0f} s; open {result.report}")
+    terminal.document(result.summary())
+    raise typer.Exit(0 if result.passed else 1)
+
+
+@app.command(epilog="Example: wallmirror doctor --json")
+def doctor(as_json: AsJson = False) -> None:
+    """Look at everything that rendering needs, and say what to do about each fault."""
+    from wallmirror.pathtracing.diagnosis import diagnose
+
+    terminal = Terminal(as_json=as_json)
+    findings = diagnose()
+    terminal.table(
+        ["", "looked at", "found"],
+        [["ok" if f.ok else "FAULT", f.name, f.detail + (f" -> {f.remedy}" if f.remedy else "")] for f in findings],
+    )
+    good = all(f.ok for f in findings)
+    terminal.say("All is well." if good else "Mend the faults above; wallmirror uses what works until then.")
+    terminal.document({"ok": good, "findings": [vars(f) for f in findings]})
+    raise typer.Exit(0 if good else 1)
+
+
+@app.command(epilog="Example: wallmirror validate flat_wall_lobes -o out/validate")
+def validate(
+    scenes: Annotated[
+        list[str] | None, typer.Argument(help="Scene names or .toml files; all of ours if left out.")
+    ] = None,
+    out: Out = Path("out/validate"),
+    views: Annotated[int, typer.Option(min=1, help="Views of each scene to compare.")] = 5,
+    spp: Annotated[int, typer.Option(min=4, max=1024, help="Samples per pixel of each of the 32 seeds.")] = 256,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Test the analytic one-bounce model against Mitsuba, scene by scene, and say what bias would have shown."""
+    from wallmirror.jobs.validating import validate_scenes, verdict
+    from wallmirror.scene import load_scene, scene_names
+
+    terminal = Terminal(as_json=as_json)
+    loaded = [load_scene(name) for name in (scenes or scene_names())]
+    with terminal.progress("validating") as advance:
+        results = validate_scenes(loaded, out, views=views, spp=spp, seed=seed, progress=advance)
+    for result in results:
+        terminal.say(("ok    " if result.passed else "FAIL  ") + verdict(result).text)
+    passed = all(r.passed for r in results)
+    terminal.say(f"{'PASSED' if passed else 'FAILED'}; open {out / 'report.html'}")
+    terminal.document({"passed": passed, "scenes": [r.summary() for r in results]})
+    raise typer.Exit(0 if passed else 1)
+
+
+@app.command(epilog="Example: wallmirror capture cornell_lobes -o out/box --max-depth 50")
+def capture(
+    scene: Annotated[str, typer.Argument(help="A scene's name, or a .toml file.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the capture set.")],
+    spp: Annotated[int | None, typer.Option(min=1, help="Samples per pixel; the scene's own if left out.")] = None,
+    max_depth: Annotated[int | None, typer.Option(min=2, help="2 is one bounce; the scene's own if left out.")] = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Render a scene's views and patterns to EXR files with a captures.toml, ready to solve."""
+    from wallmirror.jobs.capturing import capture_scene
+    from wallmirror.scene import load_scene
+
+    terminal = Terminal(as_json=as_json)
+    loaded = load_scene(scene)
+    with terminal.progress(f"filming {loaded.name}") as advance:
+        captures = capture_scene(loaded, out, spp=spp, seed=seed, max_depth=max_depth, progress=advance)
+    views, pixels, realisations = captures.radiance.shape
+    terminal.say(f"{views} views x {realisations} patterns of {pixels} pixels in {out}")
+    terminal.say(f"next: wallmirror solve {out} -o {out.with_name(out.name + '_solved')}")
+    terminal.document(
+        {"directory": str(out), "views": views, "pixels": pixels, "realisations": realisations, **captures.provenance}
+    )
+
+
+@app.command(epilog="Example: wallmirror solve out/box -o out/box_solved")
+def solve(
+    directory: Annotated[Path, typer.Argument(help="Folder with captures.toml and its EXR files.")],
+    out: Out = Path("out/solution"),
+    method: Annotated[str, typer.Option(help="auto, closed_form or maximum_likelihood.")] = "auto",
+    nonnegative: Annotated[bool, typer.Option(help="Keep BRDF and pattern >= 0.")] = True,
+    step_deg: Annotated[
+        float | None, typer.Option(help="Knot spacing of the BRDF; the data choose if left out.")
+    ] = None,
+    wall_albedo: Annotated[
+        float | None, typer.Option(help="The wall's albedo, if known, for the one-bounce check.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Recover the card's pattern and the wall's BRDF from a capture set, with error bars and certificates."""
+    from wallmirror.jobs.solving import solve_directory
+
+    terminal = Terminal(as_json=as_json)
+    solved = solve_directory(
+        directory,
+        out,
+        method=method,  # type: ignore[arg-type]  # `solve` checks it and names the choices
+        nonnegative=nonnegative,
+        step_deg=step_deg,
+        wall_albedo=wall_albedo,
+        progress=terminal.note,
+    )
+    solution = solved.solution
+    terminal.say(solution.status)
+    for warning in solution.warnings[1:]:
+        terminal.say(f"warning: {warning}")
+    if solved.judgement is not None:
+        terminal.say(f"against the known truth: the pattern is {100 * solved.judgement.source_error:.2g} % off")
+    terminal.say(f"open {out / 'report.html'}")
+    terminal.document(solved.summary())
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run a command and leave with its exit code; every foreseen failure is one sentence."""
+    given = sys.argv[1:] if arguments is None else arguments
+    try:
+        app(given)
+    except WallmirrorError as error:
+        terminal = Terminal(as_json="--json" in given)
+        terminal.error(str(error))
+        document: dict[str, Any] = {"error": str(error), "exit_code": error.exit_code}
+        terminal.document(document)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        Terminal().error("interrupted; earlier results are untouched")
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,264 @@
+"""`wallmirror solve`: a capture set in, a solution with its report out."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wallmirror.captures import CaptureSet, Truth, read_captures, read_truth
+from wallmirror.derendering.estimate import scale_free_error
+from wallmirror.derendering.solution import Solution
+from wallmirror.derendering.solve import Method, solve
+from wallmirror.files import write_atomically
+from wallmirror.report import FigureBlock, Section, TableBlock, Verdict, write_page
+from wallmirror.report.figures import recovered_brdf, recovered_source, scene_plan
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Errors against a known truth, after the best global scale.
+
+    Parameters
+    ----------
+    source_error:
+        Relative error of the pattern, to compare with the solution's predicted_error.
+    brdf_error:
+        Relative error of the BRDF over the angle sums that were seen; nan where the truth has no finite values.
+    """
+
+    source_error: float
+    brdf_error: float
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A capture set with its solution and, where a truth is known, how far that is off."""
+
+    captures: CaptureSet
+    solution: Solution
+    truth: Truth | None
+    judgement: Judgement | None
+
+    def summary(self) -> dict[str, Any]:
+        """The JSON document of the command."""
+        document = self.solution.summary()
+        if self.judgement is not None:
+            document["truth"] = {
+                "source_error": self.judgement.source_error,
+                "brdf_error": None if math.isnan(self.judgement.brdf_error) else self.judgement.brdf_error,
+            }
+        return document
+
+
+def solve_directory(
+    directory: Path,
+    out: Path,
+    *,
+    method: Method = "auto",
+    nonnegative: bool = True,
+    step_deg: float | None = None,
+    wall_albedo: float | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Solved:
+    """Read a capture set, recover pattern and BRDF, and leave solution.json, source.csv, brdf.csv and report.html.
+
+    Parameters
+    ----------
+    directory, out:
+        The capture set, and the folder to write to; earlier results there are replaced file by file.
+    method, nonnegative, step_deg, wall_albedo, progress:
+        As in `solve`.
+
+    Raises
+    ------
+    InputError, UndeterminedError
+        As `read_captures` and `solve`; nothing is written then.
+    """
+    captures = read_captures(directory)
+    truth = read_truth(directory)
+    solution = solve(
+        captures,
+        method=method,
+        nonnegative=nonnegative,
+        step_deg=step_deg,
+        wall_albedo=wall_albedo,
+        progress=progress,
+    )
+    solved = Solved(captures, solution, truth, judge(solution, truth))
+    write_solution(out, solved)
+    return solved
+
+
+def judge(solution: Solution, truth: Truth | None) -> Judgement | None:
+    """Compare a solution with the truth of a rendered capture set; None where there is no truth."""
+    if truth is None or truth.source.shape != solution.source.shape:
+        return None
+    rho = true_brdf(solution, truth)
+    brdf_error = math.nan
+    if rho is not None:
+        seen = well_seen(solution)
+        brdf_error = scale_free_error(solution.brdf[seen], rho[seen])
+    return Judgement(scale_free_error(solution.source, truth.source), brdf_error)
+
+
+def well_seen(solution: Solution) -> NDArray[np.bool_]:
+    """Nodes of the BRDF that the captures determine to better than half its peak."""
+    return np.asarray(solution.brdf_std < 0.5)
+
+
+def true_brdf(solution: Solution, truth: Truth | None) -> Array | None:
+    """The true BRDF on the solution's nodes; None for a mirror or where nothing is known."""
+    if truth is None or truth.brdf.size < 2:
+        return None
+    order = np.argsort(truth.angle_sum)
+    return np.interp(solution.angle_sum, truth.angle_sum[order], truth.brdf[order])
+
+
+def write_solution(out: Path, solved: Solved) -> None:
+    """Write a solution's files and its report page into a folder."""
+    solution = solved.solution
+    write_atomically(out / "source.csv", _source_csv(solution))
+    write_atomically(out / "brdf.csv", _brdf_csv(solution))
+    write_page(
+        out / "report.html",
+        title="A wall turned into a mirror",
+        lead=solution.status,
+        verdicts=verdicts(solved),
+        sections=[
+            Section(
+                "The scene",
+                (
+                    FigureBlock(
+                        scene_plan(
+                            solved.captures.observer, solved.captures.card, half_width=1e9, room=solved.captures.room
+                        ),
+                        "The scene from above, to scale. The camera sees the wall in the blue fields of view; the card "
+                        "(orange) is out of its sight.",
+                    ),
+                ),
+            ),
+            *solution_sections(solved),
+        ],
+    )
+    # Last, so that its presence says that the rest is complete.
+    write_atomically(out / "solution.json", solution.to_json() + "\n")
+
+
+def verdicts(solved: Solved) -> list[Verdict]:
+    """The verdict sentences of a solution, the truth's first where it is known."""
+    solution, judgement = solved.solution, solved.judgement
+    lines = []
+    if judgement is not None:
+        ratio = judgement.source_error / solution.predicted_error
+        lines.append(
+            Verdict(
+                ratio <= 2,
+                f"The pattern is {100 * judgement.source_error:.2g} % off the true one; the solution's own error bars "
+                f"said {100 * solution.predicted_error:.2g} %.",
+            )
+        )
+    lines.extend(Verdict(False, warning[0].upper() + warning[1:] + ".") for warning in solution.warnings)
+    if not solution.warnings:
+        lines.append(Verdict(True, "No certificate objects: rank, mismatch, misfit and the one-bounce check agree."))
+    return lines
+
+
+def solution_sections(solved: Solved) -> list[Section]:
+    """Pattern, BRDF and certificates of a solution as sections of a report."""
+    solution, truth = solved.solution, solved.truth
+    source_truth = truth.source if truth is not None and solved.judgement is not None else None
+    beside = ", beside the true one (grey)" if source_truth is not None else ""
+    return [
+        Section(
+            "The card's pattern",
+            (
+                "Each dot is one element of the card in one realisation of the pattern. Only ratios can be recovered: a "
+                "brighter card before a darker wall sends back the same light.",
+                FigureBlock(
+                    recovered_source(solution, source_truth), f"The recovered pattern with error bars{beside}."
+                ),
+            ),
+        ),
+        Section(
+            "The wall's BRDF",
+            (
+                "How strongly the wall sends light that arrives at angle θs out at angle θo, as a function of their sum.",
+                FigureBlock(
+                    recovered_brdf(solution, true_brdf(solution, truth)),
+                    f"The recovered BRDF with its two-sigma band{beside}.",
+                ),
+            ),
+        ),
+        Section("How far to trust it", (certificates(solved),)),
+    ]
+
+
+def certificates(solved: Solved) -> TableBlock:
+    """The certificates of a solution with what each should be."""
+    s = solved.solution
+    elements = s.source.shape[0]
+    rows = [
+        ("method", s.method.replace("_", " "), f"knots every {s.step_deg:g}°, {s.seconds:.2f} s"),
+        ("rank of the data", str(s.rank), f"{elements}, the number of elements"),
+        ("mismatch of the closed form", f"{s.mismatch:.1e}", _expected(s.mismatch_expected)),
+        ("gap to the second-best BRDF", f"{s.gap:.1e}", "far above the mismatch"),
+        ("condition of the transport", f"{s.condition:.3g}", "how much noise is amplified at most"),
+        ("misfit / stated noise", _number(s.chi_squared), "1 where model and noise are right"),
+        ("residual of the fit", f"{100 * s.residual:.2g} %", "noise alone; it does not certify one bounce"),
+        ("expected error of the pattern", f"{100 * s.predicted_error:.2g} %", "from the Cramér-Rao bound"),
+        ("free scales", str(s.components), "1, the global scale (gauge: BRDF peak = 1)"),
+    ]
+    if s.one_bounce is not None:
+        check = s.one_bounce
+        rows.append(
+            (
+                "light beyond one bounce",
+                f"{100 * check.share:.2g} %",
+                f"makes a bias of {100 * check.bias:.2g} % at a wall albedo of {check.wall_albedo:.2g}"
+                + (" (assumed)" if check.assumed else ""),
+            )
+        )
+    if solved.judgement is not None:
+        rows.append(("true error of the pattern", f"{100 * solved.judgement.source_error:.2g} %", "against the truth"))
+        if not math.isnan(solved.judgement.brdf_error):
+            rows.append(("true error of the BRDF", f"{100 * solved.judgement.brdf_error:.2g} %", "against the truth"))
+    return TableBlock(("certificate", "value", "should be"), tuple(rows))
+
+
+def _expected(value: float) -> str:
+    return "as small as rounding allows" if math.isnan(value) else f"{value:.1e} from noise alone"
+
+
+def _number(value: float) -> str:
+    return "noise not stated" if math.isnan(value) else f"{value:.3f}"
+
+
+def _csv(header: list[str], rows: list[list[float]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _source_csv(solution: Solution) -> str:
+    elements, realisations = solution.source.shape
+    rows = [
+        [i, b, solution.source[i, b], solution.source_std[i, b]] for b in range(realisations) for i in range(elements)
+    ]
+    return _csv(["element", "realisation", "radiance", "standard_deviation"], rows)
+
+
+def _brdf_csv(solution: Solution) -> str:
+    rows = np.stack([np.degrees(solution.angle_sum), solution.brdf, solution.brdf_std], axis=1)
+    return _csv(["angle_sum_deg", "brdf", "standard_deviation"], rows.tolist())
