@@ -281,13 +281,27 @@ def test_a_pixel_that_is_wrong_without_scattering_is_caught() -> None:
     assert not compare(seeds, picture(), templates=TEMPLATES).passed
 
 
-def test_darkness_compares_with_darkness() -> None:
-    # A view in which a mirror shows no strip at all.
+def test_light_where_a_mirror_shows_none_is_caught() -> None:
+    # Where nothing scatters, a dark pixel is no starved pixel: there should be nothing, exactly.
+    reference = np.where(np.arange(PIXELS) % 8 == 0, picture(), 0.0)
+    seeds = np.repeat(reference[None], 8, axis=0)
+    assert compare(seeds, reference).passed
+    seeds[:, 1, 5] = 1e-3
+    assert not compare(seeds, reference).passed
+
+
+def test_darkness_proves_nothing() -> None:
+    # All dark, and dark it should be: a scene that shows nothing cannot fail, so it does not pass either.
     dark = np.zeros((VIEWS, PIXELS))
-    found = compare(np.zeros((8, VIEWS, PIXELS)), dark)
-    assert found.kept == 0
-    assert found.passed
+    assert not compare(np.zeros((8, VIEWS, PIXELS)), dark).passed
     assert not compare(np.full((8, VIEWS, PIXELS), 0.1), dark).passed
+
+
+def test_a_comparison_of_no_pixel_does_not_pass() -> None:
+    everywhere = np.ones((VIEWS, PIXELS), dtype=bool)
+    found = compare(picture() + noisy(np.random.default_rng(15)), picture(), edges=everywhere)
+    assert found.kept == 0
+    assert not found.passed
 
 
 # -- refusals and report --------------------------------------------------------------------------------------

@@ -195,11 +195,12 @@ def _write_report(demo: Demo, pictures: dict[str, Any]) -> None:
                 ),
             ),
         ),
+        *solution_sections(main.solved),
         Section(
-            "Does the model hold? Analytic light transport against Mitsuba",
+            "Does the model hold?",
             (
-                "Before anything is solved, the model is put to the test: the same views rendered with 32 independent "
-                "seeds, against the closed form with quadrature over strips and pixels.",
+                "The solver is as good as its model of light. So the same views were rendered by Mitsuba with 32 "
+                "independent seeds and held against our analytic transport, which shares no code with it.",
                 validation_verdict(demo.validation),
                 FigureBlock(
                     radiance_maps(demo.validation.reference, demo.validation.mean, c),
@@ -214,7 +215,6 @@ def _write_report(demo: Demo, pictures: dict[str, Any]) -> None:
                 numbers(demo.validation),
             ),
         ),
-        *solution_sections(main.solved),
     ]
     if others:
         sections.append(_bounces_section(demo, pictures))
@@ -279,7 +279,8 @@ def _bounces_section(demo: Demo, pictures: dict[str, Any]) -> Section:
             "The model knows one bounce on the wall (Hypothesis 2 of the thesis). A white card or the walls of a room "
             "send light back, and another pattern explains that light almost as well: the misfit hardly shows it. So the "
             "solver asks the known geometry instead: it computes the light that card and room would send back, solves "
-            "once more with it, and warns when the pattern would turn by more than its error bars.",
+            "once more with it, and warns when the pattern would turn by more than half its error bars. The films cut off "
+            "after one bounce are controls that only a computer can make.",
             table,
             FigureBlock(error_bars(bars), "Measured error of the pattern beside what the solver's error bars claim."),
             *(

@@ -19,7 +19,7 @@ from wallmirror.derendering.solution import Solution
 from wallmirror.derendering.solve import Method, solve
 from wallmirror.files import write_atomically
 from wallmirror.report import FigureBlock, Section, TableBlock, Verdict, write_page
-from wallmirror.report.figures import recovered_brdf, recovered_source, scene_plan
+from wallmirror.report.figures import recovered_brdf, recovered_source, scene_plan, source_deviations
 
 Array = NDArray[np.float64]
 
@@ -186,6 +186,16 @@ def solution_sections(solved: Solved) -> list[Section]:
                 "brighter card before a darker wall sends back the same light.",
                 FigureBlock(
                     recovered_source(solution, source_truth), f"The recovered pattern with error bars{beside}."
+                ),
+                *(
+                    ()
+                    if source_truth is None
+                    else (
+                        FigureBlock(
+                            source_deviations(solution, source_truth),
+                            "The same, recovered minus true, with two-sigma bars: most bars should touch the line.",
+                        ),
+                    )
                 ),
             ),
         ),

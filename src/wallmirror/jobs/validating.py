@@ -180,8 +180,8 @@ def verdict(result: Validation) -> Verdict:
         text = f"{result.scene.name}: agrees to {result.comparison.relative_rms:.1e} of the brightest pixel"
     elif result.passed:
         text = (
-            f"{result.scene.name}: not told apart; gain - 1 = {gain.estimate:+.1e} ± {gain.standard_error:.0e}, and a "
-            f"gain error of {gain.detectable:.0e} would have been caught"
+            f"{result.scene.name}: model and Mitsuba are not told apart; gain - 1 = {gain.estimate:+.1e} ± "
+            f"{gain.standard_error:.0e}, and a gain error of {gain.detectable:.0e} would have been caught"
         )
     else:
         text = f"{result.scene.name}: REJECTED; gain - 1 = {gain.estimate:+.1e} ± {gain.standard_error:.0e}"

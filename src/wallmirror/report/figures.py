@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 
 from wallmirror.comparison import Comparison
@@ -47,18 +48,21 @@ def embed(figure: Figure) -> str:
 
 def scene_plan(observer: Observer, card: Card, *, half_width: float, room: Room | None = None) -> Figure:
     """The scene from above, to scale: wall, card, observer and the field of view of every view."""
-    figure = _figure(7.2, 4.4)
-    axes = figure.add_subplot()
     x_o, y_o = observer.position
     half = observer.fov / 2
-    reach = 0.0
-    for number, angle in enumerate(observer.view_angles):
-        ends = [x_o + y_o * math.tan(angle + side * half) for side in (1, -1)]
-        reach = max(reach, *(abs(e) for e in ends))
-        style: dict[str, Any] = {"alpha": 0.55 / math.sqrt(observer.views), "color": OURS, "linewidth": 0}
-        axes.add_patch(Polygon([(x_o, y_o), (ends[0], 0), (ends[1], 0)], **style))
-        if number in (0, observer.views - 1):
-            axes.plot([ends[0], x_o, ends[1]], [0, y_o, 0], color=OURS, linewidth=0.7, alpha=0.7)
+    shown = sorted({0, observer.views // 2, observer.views - 1})
+    corners = [[x_o + y_o * math.tan(angle + side * half) for side in (1, -1)] for angle in observer.view_angles]
+    reach = float(np.max(np.abs(corners)))
+    depth = max(room.depth if room else 0.0, -y_o, -card.y)
+    figure = _figure(7.2, min(6.5, 1.1 + 6.0 * (1.2 * depth) / (2.4 * reach)))
+    axes = figure.add_subplot()
+    axes.add_patch(
+        Polygon([(x_o, y_o), (np.min(corners), 0), (np.max(corners), 0)], color=OURS, alpha=0.10, linewidth=0)
+    )
+    for number in shown:
+        ends = corners[number]
+        axes.add_patch(Polygon([(x_o, y_o), (ends[0], 0), (ends[1], 0)], color=OURS, alpha=0.13, linewidth=0))
+        axes.plot([ends[0], x_o, ends[1]], [0, y_o, 0], color=OURS, linewidth=0.6, alpha=0.6)
     span = max(reach, max(abs(x) for x in card.elements_x), room.half_width if room else 0.0)
     width = min(half_width, 1.12 * span)
     axes.add_patch(Rectangle((-width, 0), 2 * width, 0.025 * span, color=INK))
@@ -176,9 +180,32 @@ def recovered_source(solution: Solution, truth: Array | None = None) -> Figure:
         axes.set_title(f"pattern {b + 1}", fontsize=10)
         axes.set_xticks(place if elements <= 12 else place[:: elements // 8])
         _clean(axes)
+    panels[0].set_ylim(0, 1.18)
     panels[0].set_ylabel("radiance / brightest")
-    panels[0].legend(frameon=False, fontsize=8)
+    panels[0].legend(frameon=False, fontsize=8, loc="upper right")
     figure.supxlabel("element of the card", fontsize=10)
+    return figure
+
+
+def source_deviations(solution: Solution, truth: Array) -> Figure:
+    """Recovered minus true radiance of every element and realisation, in per cent of the brightest, with error bars."""
+    scale = float(np.sum(solution.source * truth) / np.sum(solution.source**2))
+    top = float(np.max(truth)) / 100
+    deviation = (scale * solution.source - truth).T.ravel() / top
+    bars = 2 * scale * solution.source_std.T.ravel() / top
+    figure = _figure(10.5, 2.2)
+    axes = figure.add_subplot()
+    axes.axhline(0, color=INK, linewidth=0.8)
+    place = np.arange(deviation.size)
+    axes.errorbar(place, deviation, yerr=bars, fmt="o", color=OURS, markersize=4, capsize=3)
+    elements = truth.shape[0]
+    for b in range(1, truth.shape[1]):
+        axes.axvline(b * elements - 0.5, color="#d0d7de", linewidth=0.8)
+    axes.set_xticks(
+        (np.arange(truth.shape[1]) + 0.5) * elements - 0.5, [f"pattern {b + 1}" for b in range(truth.shape[1])]
+    )
+    axes.set_ylabel("off by (% of brightest)")
+    _clean(axes)
     return figure
 
 
@@ -207,14 +234,19 @@ def recovered_brdf(solution: Solution, truth: Array | None = None) -> Figure:
 
 def error_bars(rows: list[tuple[str, float, float]]) -> Figure:
     """Measured error beside predicted error of the pattern for several solutions, on a log axis."""
-    figure = _figure(7.2, 0.55 * len(rows) + 1.1)
+    figure = _figure(7.2, 0.55 * len(rows) + 1.4)
     axes = figure.add_subplot()
     place = np.arange(len(rows))[::-1]
     axes.barh(place + 0.18, [100 * r[1] for r in rows], height=0.34, color=OURS, label="measured")
     axes.barh(place - 0.18, [100 * r[2] for r in rows], height=0.34, color="#afb8c1", label="its own error bars say")
     axes.set_yticks(place, [r[0] for r in rows], fontsize=9)
     axes.set_xscale("log")
+    values = [100 * v for r in rows for v in r[1:] if v > 0]
+    axes.set_xlim(0.5 * min(values), 2 * max(values))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_minor_locator(NullLocator())
     axes.set_xlabel("error of the pattern (%)")
-    axes.legend(frameon=False, fontsize=9, loc="lower right")
+    figure.legend(frameon=False, fontsize=9, loc="outside upper right", ncols=2)
     _clean(axes)
     return figure

@@ -65,7 +65,7 @@ def write_page(path: Path, *, title: str, lead: str, verdicts: list[Verdict], se
         f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{escape(title)}</title><style>{_STYLE}</style></head>
-<body><main><h1>{escape(title)}</h1><p class="lead">{escape(lead)}</p>
+<body><main><h1>{escape(title)}</h1><p class="lead">{_text(lead)}</p>
 {"".join(map(_block, verdicts))}
 <nav><ol>{contents}</ol></nav>
 {body}
@@ -74,19 +74,24 @@ def write_page(path: Path, *, title: str, lead: str, verdicts: list[Verdict], se
     )
 
 
+def _text(text: str) -> str:
+    """Escaped, with numbers held together with their per cent sign."""
+    return escape(text, quote=True).replace(" %", "\u00a0%")
+
+
 def _block(block: Block) -> str:
     if isinstance(block, str):
-        return f"<p>{escape(block)}</p>"
+        return f"<p>{_text(block)}</p>"
     if isinstance(block, Verdict):
         kind = {True: "good", False: "bad", None: "plain"}[block.good]
         mark = {True: "✓", False: "✗", None: "•"}[block.good]
-        return f'<p class="verdict {kind}"><span>{mark}</span>{escape(block.text)}</p>'
+        return f'<p class="verdict {kind}"><span>{mark}</span>{_text(block.text)}</p>'
     if isinstance(block, FigureBlock):
-        alt = escape(block.caption, quote=True)
+        alt = _text(block.caption)
         return f'<figure><img src="{embed(block.figure)}" alt="{alt}"><figcaption>{alt}</figcaption></figure>'
-    head = "".join(f"<th>{escape(c)}</th>" for c in block.columns)
-    rows = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in block.rows)
-    caption = f"<caption>{escape(block.caption)}</caption>" if block.caption else ""
+    head = "".join(f"<th>{_text(c)}</th>" for c in block.columns)
+    rows = "".join("<tr>" + "".join(f"<td>{_text(cell)}</td>" for cell in row) + "</tr>" for row in block.rows)
+    caption = f"<caption>{_text(block.caption)}</caption>" if block.caption else ""
     return f'<div class="scroll"><table>{caption}<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
 
 
