@@ -104,6 +104,19 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
         assert abs(covered - 0.99 * RUNS) < 4 * math.sqrt(0.99 * 0.01 * RUNS)
 
 
+def test_a_bias_is_scipys_t_test_of_least_squares_amplitudes() -> None:
+    for comparison, seeds in zip(null()[0][:5], null()[1]):
+        weight = 1 / (picture() + 1e-2 * picture().max())
+        for bias, shape in zip(comparison.biases, (picture(), shift())):
+            column = (weight * shape).reshape(-1, 1)
+            amplitudes = [np.linalg.lstsq(column, (weight * (s - picture())).ravel())[0][0] for s in seeds]
+            expected = stats.ttest_1samp(amplitudes, 0.0)
+            assert bias.estimate == pytest.approx(np.mean(amplitudes), rel=1e-10)
+            assert bias.standard_error == pytest.approx(stats.sem(amplitudes), rel=1e-10)
+            assert bias.p_value == pytest.approx(expected.pvalue, rel=1e-8)
+            np.testing.assert_allclose(bias.interval, expected.confidence_interval(0.99), rtol=1e-8)
+
+
 # -- planted faults -------------------------------------------------------------------------------------------
 
 

@@ -1,0 +1,187 @@
+"""The command line: exit codes, one sentence for each failure, JSON, and nothing lost. No Mitsuba is imported."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from wallmirror import CaptureSet, load_scene, radiance, transport_matrix, write_captures
+from wallmirror.cli import main
+from wallmirror.jobs.capturing import truth_of
+
+SCENE_TEXT = """
+format = 1
+title = "small"
+[wall]
+brdf = "gaussian_train"
+centres_deg = [-20.0, 0.0, 25.0]
+sigma_deg = 3.0
+[observer]
+position = [0.0, -5.0]
+fov_deg = 60.0
+views = 3
+scan_deg = 90.0
+pixels = 60
+[card]
+elements_x = [-1.0, 0.2, 1.1]
+y = -1.0
+element_width = 0.02
+element_height = 0.02
+[source]
+realisations = 4
+seed = 3
+"""
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "small.toml"
+    path.write_text(SCENE_TEXT)
+    return load_scene(path)
+
+
+def captures_of(scene, source, *, noise=1e-3):
+    clean = radiance(transport_matrix(scene.observer, scene.card, scene.wall.brdf, tolerance=1e-6), source)
+    sigma = noise * clean.max() + 1e-12
+    noisy = clean + sigma * np.random.default_rng(0).standard_normal(clean.shape)
+    return CaptureSet(observer=scene.observer, card=scene.card, radiance=noisy, variance=np.full(clean.shape, sigma**2))
+
+
+@pytest.fixture
+def folder(scene, tmp_path):
+    write_captures(tmp_path / "set", captures_of(scene, scene.source), truth=truth_of(scene))
+    return tmp_path / "set"
+
+
+def run(capsys, *arguments):
+    with pytest.raises(SystemExit) as stop:
+        main([str(a) for a in arguments])
+    captured = capsys.readouterr()
+    return stop.value.code or 0, captured.out, captured.err
+
+
+def test_solve_leaves_everything_and_says_how_good_it_is(capsys, folder, tmp_path):
+    code, out, _ = run(capsys, "solve", folder, "-o", tmp_path / "out")
+    assert code == 0
+    assert "Recovered 3 elements in 4 patterns by maximum likelihood" in out
+    assert "against the known truth" in out
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"solution.json", "source.csv", "brdf.csv", "report.html"}
+
+
+def test_solve_prints_one_json_document(capsys, folder, tmp_path):
+    code, out, err = run(capsys, "solve", folder, "-o", tmp_path / "out", "--json")
+    document = json.loads(out)
+    assert code == 0
+    assert document["verdict"] == "good"
+    assert document["truth"]["source_error"] < 3 * document["predicted_error"]
+    assert "maximum likelihood" in err
+
+
+def spoil_missing_file(folder):
+    (folder / "view01_real02.exr").unlink()
+    return "view01_real02.exr"
+
+
+def spoil_altered_byte(folder):
+    path = folder / "view00_real00.exr"
+    data = bytearray(path.read_bytes())
+    data[-20] ^= 0x40
+    path.write_bytes(data)
+    return "view00_real00.exr"
+
+
+def spoil_truncated(folder):
+    path = folder / "view00_real01.exr"
+    path.write_bytes(path.read_bytes()[:200])
+    return "view00_real01.exr"
+
+
+def spoil_fov(folder):
+    path = folder / "captures.toml"
+    lines = ["fov_deg = 180.0" if line.startswith("fov_deg") else line for line in path.read_text().splitlines()]
+    path.write_text("\n".join(lines))
+    return "fov_deg"
+
+
+def spoil_misspelt(folder):
+    path = folder / "captures.toml"
+    path.write_text(path.read_text().replace("view_angles_deg", "view_angels_deg"))
+    return "captures.toml"
+
+
+def spoil_doubled(folder):
+    path = folder / "captures.toml"
+    path.write_text(path.read_text().replace("realisation = 1", "realisation = 0", 1))
+    return "captures.toml"
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [spoil_missing_file, spoil_altered_byte, spoil_truncated, spoil_fov, spoil_misspelt, spoil_doubled],
+    ids=lambda f: f.__name__,
+)
+def test_bad_captures_are_one_sentence_exit_2_and_nothing_lost(capsys, folder, tmp_path, spoil):
+    out = tmp_path / "out"
+    assert run(capsys, "solve", folder, "-o", out)[0] == 0
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    named = spoil(folder)
+    code, printed, err = run(capsys, "solve", folder, "-o", out)
+    assert code == 2
+    assert printed == ""
+    assert named in err
+    assert len([line for line in err.splitlines() if line.strip()]) == 1
+    assert "Traceback" not in err
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+
+
+def test_undetermined_is_exit_3_with_what_would_help(capsys, scene, tmp_path):
+    for number, (source, words) in enumerate(
+        [
+            (scene.source[:, :2], "at least 3 different patterns"),
+            (np.zeros_like(scene.source), "light the card"),
+            (np.repeat(scene.source[:, :1], 4, axis=1), "more different patterns"),
+        ]
+    ):
+        folder = tmp_path / f"set{number}"
+        quiet = 0.0 if not source.any() else 1e-3
+        captures = captures_of(scene, source, noise=quiet)
+        if not source.any():
+            captures = CaptureSet(observer=scene.observer, card=scene.card, radiance=np.zeros(captures.radiance.shape))
+        write_captures(folder, captures)
+        code, out, err = run(capsys, "solve", folder, "-o", tmp_path / f"out{number}", "--json")
+        assert code == 3
+        assert words in err
+        assert json.loads(out)["exit_code"] == 3
+        assert not (tmp_path / f"out{number}").exists()
+
+
+def test_unknown_scene_and_method_are_exit_2(capsys, folder, tmp_path):
+    code, _, err = run(capsys, "capture", "flat_wal_lobes", "-o", tmp_path / "x")
+    assert code == 2
+    assert "flat_wall_lobes" in err
+    code, _, err = run(capsys, "solve", folder, "--method", "magic", "-o", tmp_path / "x")
+    assert code == 2
+    assert "closed_form" in err
+
+
+def test_usage_errors_are_exit_2(capsys):
+    assert run(capsys, "solve")[0] == 2
+    assert run(capsys, "validate", "--spp", "0")[0] == 2
+
+
+@pytest.mark.parametrize("command", ["demo", "doctor", "validate", "capture", "solve"])
+def test_help_has_an_example(capsys, command):
+    code, out, _ = run(capsys, command, "--help")
+    assert code == 0
+    assert f"wallmirror {command}" in out
+
+
+def test_the_core_imports_neither_mitsuba_nor_matplotlib():
+    program = (
+        "import sys, wallmirror; bad = {'mitsuba', 'drjit', 'matplotlib', 'typer', 'rich'} & set(sys.modules);"
+        "sys.exit(', '.join(bad) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
