@@ -76,10 +76,12 @@ class Mirror(BRDF):
 
 @dataclass(frozen=True, kw_only=True)
 class Phong(AngleSumBRDF):
-    """Specular Phong lobe R (n + 2) / (2 pi) cos(u)^n about the mirror direction, zero beyond 90 deg.
+    """Specular Phong lobe c cos(u)^n about the mirror direction, zero beyond 90 deg.
 
     In the plane this is Phong's cosine of the angle to the mirrored direction; along z it is continued
-    cylindrically like every model of this module, so it is not the rotationally symmetric 3-D lobe.
+    cylindrically like every model of this module, so it is not the rotationally symmetric 3-D lobe. `reflectance` R
+    is the share of light at normal incidence that comes back, R = c (pi/2) B(n/2 + 1, 1/2), so energy is conserved
+    for R <= 1.
     """
 
     exponent: float = 50.0
@@ -92,8 +94,14 @@ class Phong(AngleSumBRDF):
     def of_sum(self, u: ArrayLike) -> Array:
         """Value in 1/sr at angle sums u in radians, same shape."""
         u = np.asarray(u, dtype=np.float64)
-        cosine = np.where(np.abs(u) < math.pi / 2, np.cos(u), 0.0)
-        return self.reflectance * (self.exponent + 2) / (2 * math.pi) * cosine**self.exponent
+        front = np.abs(u) < math.pi / 2
+        power = np.where(front, np.cos(u), 1.0) ** self.exponent
+        return np.where(front, self._peak() * power, 0.0)
+
+    def _peak(self) -> float:
+        half = self.exponent / 2
+        log_beta = math.lgamma(half + 1) + math.lgamma(0.5) - math.lgamma(half + 1.5)
+        return self.reflectance / (math.pi / 2) * math.exp(-log_beta)
 
     @property
     def angular_scale(self) -> float:
@@ -138,6 +146,8 @@ class GaussianTrain(AngleSumBRDF):
         if self.height not in ("peak", "per_degree", "per_radian"):
             raise InputError(f'is "{self.height}"; choose "peak", "per_degree" or "per_radian"', field="wall.height")
         _require_range("wall.scale", self.scale, 0, math.inf)
+        if not math.isfinite(self._peak()):
+            raise InputError(f"is {math.degrees(self.sigma):g}, too narrow for a finite height", field="wall.sigma_deg")
 
     @classmethod
     def of_the_text(cls) -> GaussianTrain:
@@ -156,10 +166,11 @@ class GaussianTrain(AngleSumBRDF):
     def of_sum(self, u: ArrayLike) -> Array:
         """Value in 1/sr at angle sums u in radians, same shape."""
         u = np.asarray(u, dtype=np.float64)
-        # exp(-z^2/2) directly: dividing a density by its peak turns into 0/0 for tiny sigma.
+        # exp(-z^2/2) directly: dividing a density by its peak turns into 0/0 for tiny sigma. exp(-40^2/2) is 0, and z
+        # beyond it may overflow.
         total = np.zeros(u.shape)
         for centre in self.centres:
-            total += np.exp(-0.5 * ((u - centre) / self.sigma) ** 2)
+            total += np.exp(-0.5 * (np.minimum(np.abs(u - centre), 40 * self.sigma) / self.sigma) ** 2)
         return self._peak() * total
 
     def _peak(self) -> float:
@@ -192,7 +203,7 @@ class AngleSumTable(AngleSumBRDF):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", _checked_table(self.values, 1))
-        if not self.start < self.stop:
+        if not -math.inf < self.start < self.stop < math.inf:
             raise InputError("the first node must lie before the last", field="wall.table")
 
     def of_sum(self, u: ArrayLike) -> Array:

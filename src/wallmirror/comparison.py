@@ -13,6 +13,7 @@ it; the seeds' scatter is the only estimate of noise used. Three kinds of eviden
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.optimize import brentq
 
 from wallmirror.errors import InputError
 
@@ -113,10 +115,10 @@ class Comparison:
                     "name": b.name,
                     "unit": b.unit,
                     "estimate": b.estimate,
-                    "standard_error": b.standard_error,
-                    "interval_99": list(b.interval),
+                    "standard_error": b.standard_error if math.isfinite(b.standard_error) else None,
+                    "interval_99": [end if math.isfinite(end) else None for end in b.interval],
                     "p_value": b.p_value,
-                    "detectable_99": b.detectable,
+                    "detectable_99": b.detectable if math.isfinite(b.detectable) else None,
                 }
                 for b in self.biases
             ],
@@ -160,29 +162,35 @@ def compare(
         raise InputError(f"renders of shape {seeds.shape} do not match a reference of shape {reference.shape}")
     if seeds.shape[0] < 8:
         raise InputError(f"{seeds.shape[0]} seeds are too few to know their scatter; render at least 8", field="seeds")
-    brightest = float(reference.max())
+    if not (np.all(np.isfinite(seeds)) and np.all(np.isfinite(reference))):
+        raise InputError("holds a value that is not finite", field="seeds")
+    brightest = float(reference.max(initial=0.0))
     no_edges = np.ones(reference.shape, dtype=bool) if edges is None else ~edges
     bright = reference > _STARVED * brightest
     deviation = seeds - reference
     scatter = deviation.std(axis=0, ddof=1)
     exact = bool(np.all(scatter[no_edges] <= 1e-6 * brightest))
     keep = no_edges if exact else bright & no_edges  # where nothing scatters, darkness is evidence too
-    weights = np.where(keep, 1.0 / (reference + 1e-2 * brightest) ** 2, 0.0)
+    lit = keep & (brightest > 0)
+    weights = np.divide(1.0, (reference + 1e-2 * brightest) ** 2, out=np.zeros(reference.shape), where=lit)
     shapes = {("gain", "of 1"): reference, **(templates or {})}
-    biases = tuple(_bias(name, unit, deviation, shape, weights) for (name, unit), shape in shapes.items())
-    z = _z_scores(deviation, keep)
+    # One level for all tests of this comparison: the biases, the largest score and the tiles.
+    level = SIGNIFICANCE / (len(shapes) + 2)
+    biases = tuple(_bias(name, unit, deviation, shape, weights, level) for (name, unit), shape in shapes.items())
+    z = _z_scores(deviation, keep, 1e-5 * brightest)
     tile_p = _tile_p(deviation, reference, keep)
     tiles = tile_p[np.isfinite(tile_p)]
     kept = z[keep]
     largest = float(np.max(np.abs(kept), initial=0.0))
-    largest_p = float(-np.expm1(kept.size * np.log1p(-2 * stats.norm.sf(largest)))) if kept.size else 1.0
+    largest_p = float(-np.expm1(kept.size * np.log1p(-2 * stats.norm.sf(largest)))) if largest > 0 else 1.0
     uniformity = float(stats.kstest(tiles, "uniform").pvalue) if tiles.size else 1.0
-    relative = deviation.mean(axis=0)[keep] / brightest
-    if exact:
+    relative = deviation.mean(axis=0)[keep] / (brightest or 1.0)
+    if not np.any(bright & keep):
+        passed = False  # nothing was compared
+    elif exact:
         # Without scatter there is nothing to test statistically: float32 rounding of a sum of samples remains.
-        passed = bool(np.any(bright & keep) and np.max(np.abs(relative)) < 1e-5)
+        passed = bool(np.max(np.abs(relative)) < 1e-5)
     else:
-        level = SIGNIFICANCE / (len(biases) + 2)
         passed = min([largest_p, uniformity, *(b.p_value for b in biases)]) > level
     return Comparison(
         passed=passed,
@@ -202,7 +210,7 @@ def compare(
     )
 
 
-def _bias(name: str, unit: str, deviation: Array, shape: Array, weights: Array) -> BiasTest:
+def _bias(name: str, unit: str, deviation: Array, shape: Array, weights: Array, level: float) -> BiasTest:
     """Least-squares amplitude of a template in each seed; the weights depend on the reference alone."""
     power = float(np.sum(weights * shape * shape))
     if power == 0:
@@ -215,19 +223,32 @@ def _bias(name: str, unit: str, deviation: Array, shape: Array, weights: Array) 
         return BiasTest(name, unit, estimate, 0.0, (estimate, estimate), 1.0 if abs(estimate) < 1e-5 else 0.0, 1e-5)
     half = float(stats.t.ppf(0.995, count - 1)) * error
     p_value = float(2 * stats.t.sf(abs(estimate) / error, count - 1))
-    # Caught when |t| passes the two-sided threshold; 99 % of the noncentral t must lie beyond it.
-    threshold = float(stats.t.isf(SIGNIFICANCE / 10, count - 1)) + float(stats.t.ppf(_POWER, count - 1))
-    return BiasTest(name, unit, estimate, error, (estimate - half, estimate + half), p_value, threshold * error)
+    return BiasTest(
+        name, unit, estimate, error, (estimate - half, estimate + half), p_value, _units(level, count) * error
+    )
 
 
-def _z_scores(deviation: Array, keep: NDArray[np.bool_]) -> Array:
-    """t over seeds in each pixel, mapped to the normal score of the same probability."""
+@functools.cache
+def _units(level: float, count: int) -> float:
+    """The bias, in standard errors, at which 99 % of the noncentral t lie beyond the two-sided threshold."""
+    threshold = float(stats.t.isf(level / 2, count - 1))
+    return float(brentq(lambda d: stats.nct.sf(threshold, count - 1, d) - _POWER, threshold, 10 * threshold + 10))
+
+
+def _z_scores(deviation: Array, keep: NDArray[np.bool_], rounding: float) -> Array:
+    """t over seeds in each pixel, mapped to the normal score of the same probability.
+
+    A pixel that does not scatter at all scores 0 within `rounding`, and beyond it 38, the largest score that float64 knows.
+    """
     count = deviation.shape[0]
     error = deviation.std(axis=0, ddof=1) / math.sqrt(count)
     good = keep & (error > 0)
-    t = np.divide(deviation.mean(axis=0), error, out=np.zeros(error.shape), where=good)
+    mean = deviation.mean(axis=0)
+    t = np.where(np.abs(mean) > rounding, np.copysign(np.inf, mean), 0.0)
+    np.divide(mean, error, out=t, where=good)
     # Through the nearer tail, where probabilities keep their precision.
-    return np.asarray(-np.sign(t) * stats.norm.ppf(stats.t.sf(np.abs(t), count - 1)), dtype=np.float64)
+    score = np.minimum(-stats.norm.ppf(stats.t.sf(np.abs(t), count - 1)), 38.0)
+    return np.asarray(np.sign(t) * score, dtype=np.float64)
 
 
 def _tile_p(deviation: Array, reference: Array, keep: NDArray[np.bool_]) -> Array:

@@ -155,20 +155,21 @@ def _scene(root: Fields, *, name: str) -> Scene:
 
 def read_observer(fields: Fields) -> Observer:
     """An Observer from the table [observer] of a scene or capture set; the caller handles extra fields."""
-    fov = math.radians(fields.number("fov_deg"))
+    fov_deg = fields.number("fov_deg")
+    if not 0 < fov_deg < 180:
+        raise fields.error("fov_deg", f"a field of view of {fov_deg:g} deg is not between 0 and 180")
+    fov = math.radians(fov_deg)
     position = fields.numbers("position", size=2)
     pixels = fields.integer("pixels", low=1, high=1_000_000)
     placement = fields.choice("pixels_at", ("centres", "edges"), "centres")
     if fields.has("view_angles_deg"):
         angles = tuple(math.radians(a) for a in fields.numbers("view_angles_deg"))
-    elif 0 < fov < math.pi:
+    else:
         angles = scan_angles(
             fields.integer("views", low=1, high=100_000),
             scan=math.radians(fields.number("scan_deg")),
             fov=fov,
         )
-    else:
-        angles = (0.0,)  # the field of view is refused by Observer, with its own sentence
     fields.finish()
     return Observer(
         position=(position[0], position[1]),
@@ -244,12 +245,15 @@ def _source(fields: Fields, card: Card) -> Array:
     level = fields.number("level", 1.0, low=0.0)
     if fields.has("patterns"):
         rows = fields.rows("patterns")
+        if not rows:
+            raise fields.error("patterns", "names no pattern; give at least one")
         source = np.asarray(rows, dtype=np.float64).reshape(len(rows), -1).T
     else:
         rng = np.random.default_rng(fields.integer("seed", 0))
         source = rng.random((card.elements, fields.integer("realisations", low=1, high=100_000)))
     fields.finish()
-    return level * source
+    with np.errstate(over="ignore"):  # refused as not finite by Scene
+        return np.asarray(level * source, dtype=np.float64)
 
 
 def _render(fields: Fields) -> RenderSettings:

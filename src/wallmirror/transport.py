@@ -95,13 +95,20 @@ def build_kernel(
     """
     if weights not in get_args(Weights):
         raise InputError(f'is "{weights}"; choose one of {", ".join(get_args(Weights))}', field="transport")
+    half_pixel, half_strip, orders = _orders(observer, card, weights, resolution, tolerance)
+    return _kernel(observer, card, weights, half_pixel, half_strip, *orders)
+
+
+def _orders(
+    observer: Observer, card: Card, weights: Weights, resolution: float, tolerance: float
+) -> tuple[float, float, tuple[int, int]]:
+    """Half widths of pixel (in tangents) and strip (in metres), and the quadrature orders along both."""
     points = weights != "physical"
     half_pixel = 0.0 if points else pixel_half_width(observer)
     half_strip = 0.0 if points else card.element_width / 2
     pixel_turn, strip_turn = _extent_in_angle(observer, card, half_pixel, half_strip)
-    along_pixel = quadrature_order(pixel_turn / resolution, tolerance)
-    along_strip = quadrature_order(strip_turn / resolution, tolerance)
-    return _kernel(observer, card, weights, half_pixel, half_strip, along_pixel, along_strip)
+    orders = quadrature_order(pixel_turn / resolution, tolerance), quadrature_order(strip_turn / resolution, tolerance)
+    return half_pixel, half_strip, orders
 
 
 def transport_matrix(
@@ -130,18 +137,26 @@ def transport_matrix(
     """
     if isinstance(brdf, Mirror):
         return mirror_matrix(observer, card, brdf, weights=weights)
-    scale = brdf.angular_scale
-    coarse = build_kernel(observer, card, weights=weights, resolution=scale, tolerance=tolerance).apply(brdf)
-    if weights != "physical":
-        return coarse
-    # The rule for Gaussian lobes gives the orders; halving the scale (about twice the nodes) checks them on this BRDF.
-    while scale > brdf.angular_scale / 16:
-        scale /= 2
-        fine = build_kernel(observer, card, weights=weights, resolution=scale, tolerance=tolerance).apply(brdf)
+    half_pixel, half_strip, orders = _orders(observer, card, weights, brdf.angular_scale, tolerance)
+    coarse = _kernel(observer, card, weights, half_pixel, half_strip, *orders).apply(brdf)
+    # The orders are those for Gaussian lobes; half as many again must agree on this BRDF and this geometry.
+    while half_pixel > 0 or half_strip > 0:
+        orders = _more(orders[0], half_pixel), _more(orders[1], half_strip)
+        if max(orders) > _MAX_ORDER:
+            raise InputError(
+                f"a strip or pixel needs more than {_MAX_ORDER} quadrature nodes to reach {tolerance:g}; narrow the "
+                "strips, use more pixels or accept a larger tolerance",
+                field="card.element_width",
+            )
+        fine = _kernel(observer, card, weights, half_pixel, half_strip, *orders).apply(brdf)
         if np.max(np.abs(fine - coarse), initial=0.0) <= tolerance * np.max(np.abs(fine), initial=0.0):
             return fine
         coarse = fine
     return coarse
+
+
+def _more(order: int, half_width: float) -> int:
+    return order + max(2, order // 2) if half_width > 0 else 1
 
 
 def mirror_matrix(observer: Observer, card: Card, mirror: Mirror, *, weights: Weights = "physical") -> Array:
@@ -158,7 +173,8 @@ def mirror_matrix(observer: Observer, card: Card, mirror: Mirror, *, weights: We
 
     def image_tangent(x: Array) -> Array:
         # x = x_o + depth tan(atan t - view): where on the sensor the point x of the card appears.
-        tangent: Array = np.tan(np.arctan((x - x_o) / depth) + view)
+        # What lies behind the image plane is infinitely far out on its side.
+        tangent: Array = np.tan(np.clip(np.arctan((x - x_o) / depth) + view, -math.pi / 2, math.pi / 2))
         return tangent
 
     if weights != "physical" or card.is_points:
@@ -168,21 +184,29 @@ def mirror_matrix(observer: Observer, card: Card, mirror: Mirror, *, weights: We
                 field="card.element_width",
             )
         pitch = t[1] - t[0] if t.size > 1 else 2 * math.tan(observer.fov / 2)
-        hit = np.abs(t[:, None] - image_tangent(centres)) <= pitch / 2
+        # Round, so that an image on the edge of two pixels falls into one of them and into no more.
+        hit = np.arange(t.size)[:, None] == np.floor((image_tangent(centres) - t[0]) / pitch + 0.5)
         theta_s = incident_angles(centres, card.distance, wall_points(observer)[..., None])
         factor = np.cos(theta_s) if weights == "cosine" else 1.0
         return np.where(hit, mirror.reflectance * factor, 0.0)
 
     half = pixel_half_width(observer)
+    if half == 0:  # points
+        ends = [image_tangent(centres + side * card.element_width / 2) for side in (-1, 1)]
+        return np.where((t[:, None] > ends[0]) & (t[:, None] < ends[1]), mirror.reflectance, 0.0)
     low = np.maximum(t[:, None] - half, image_tangent(centres - card.element_width / 2))
     high = np.minimum(t[:, None] + half, image_tangent(centres + card.element_width / 2))
-    nodes, node_weights = np.polynomial.legendre.leggauss(4)
-    inside = 0.5 * (low + high)[..., None] + 0.5 * (high - low)[..., None] * nodes
-    # A pixel's rays reach heights up to `half * path` on the card; only those within the strip see it.
-    path = depth / (np.cos(view)[..., None] + inside * np.sin(view)[..., None])
-    seen = np.minimum(1.0, card.element_height / 2 / np.abs(half * path))
-    share = np.where(high > low, (high - low) / (2 * half), 0.0)
-    matrix: Array = mirror.reflectance * share * np.sum(0.5 * node_weights * seen, axis=-1)
+    high = np.maximum(low, high)
+    # A pixel's rays reach heights up to `half * path` on the card, path = depth / (cos view + t sin view); those within
+    # the strip see it. Their share is a line in t, cut off at 1: exact by the midpoint rule on each side of the bend.
+    slope, rise = np.cos(view), np.sin(view)
+    strip = card.element_height / (2 * half * depth)
+    bend = np.divide(1 / strip - slope, rise, out=np.zeros_like(view), where=rise != 0)
+    bend = np.clip(bend, low, high)
+    seen = np.zeros(low.shape)
+    for a, b in ((low, bend), (bend, high)):
+        seen += (b - a) * np.minimum(1.0, strip * (slope + 0.5 * (a + b) * rise))
+    matrix: Array = mirror.reflectance * seen / (2 * half)
     return matrix
 
 
@@ -233,9 +257,10 @@ def quadrature_order(width: float, tolerance: float) -> int:
     """
     if width <= 0:
         return 1
-    offsets = np.linspace(0.0, width / 2 + 4.0, 33)
+    # Lobes every quarter of their width, so that none slips between the nodes unseen.
+    offsets = np.linspace(0.0, width / 2 + 4.0, 33 + int(2 * width))
     reference = _lobe_average(width, offsets)
-    for order in range(1, _MAX_ORDER + 1):
+    for order in range(1 + int(width / 4), _MAX_ORDER + 1):  # nodes further apart than the lobe's width see nothing
         nodes, weights = np.polynomial.legendre.leggauss(order)
         values = np.exp(-0.5 * (offsets[:, None] + 0.5 * width * nodes) ** 2) @ (0.5 * weights)
         if np.max(np.abs(values - reference)) <= tolerance:
@@ -298,25 +323,27 @@ def _kernel(
     elif card.is_points:
         weight = average * np.cos(theta_s) ** 4 / card.distance**2
     else:
-        heights = _heights_on_wall(observer, t, half_pixel)
-        weight = np.zeros(theta_s.shape)
-        for height, share in heights:
-            z = height[:, :, None, :, None]
-            half = card.element_height / 2
-            weight += share * strip_factor(card.distance, source_x - wall_x, -half - z, half - z)
+        view = np.asarray(observer.view_angles)[:, None, None]
+        path = observer.distance / (np.cos(view) + t * np.sin(view))
+        reach = (half_pixel * path)[:, :, None, :, None]  # how far up the wall the pixel sees
+        weight = _mean_strip_factor(card.distance, source_x - wall_x, card.element_height / 2, reach)
         weight *= average * card.element_width
     shape = (*theta_s.shape[:3], -1)
     theta_o = np.broadcast_to(theta_o, theta_s.shape)
     return Kernel(theta_s.reshape(shape), theta_o.reshape(shape), np.ascontiguousarray(weight).reshape(shape))
 
 
-def _heights_on_wall(observer: Observer, t: Array, half_pixel: float) -> list[tuple[Array, float]]:
-    """Heights (A, N, pixel node) at which a pixel's rays meet the wall, with their shares.
+def _mean_strip_factor(distance: float, dx: Array, half: float, reach: Array) -> Array:
+    """Mean of `strip_factor` over wall points from -reach to reach below a strip from -half to half, in 1/m.
 
-    The strip's factor is even and smooth in the height, so three Gauss-Legendre nodes over the pixel's upper
-    half err by less than (pixel height / card distance)^6.
+    With G(h) = z^2 h atan(h / a) / (2 a^3), whose derivative is the antiderivative of `strip_factor`, the mean is
+    [G(half + reach) - G(half - reach)] / reach; the difference of the arctangents is taken as one.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(3)
-    view = np.asarray(observer.view_angles)[:, None, None]
-    path = observer.distance / (np.cos(view) + t * np.sin(view))
-    return [(half_pixel * 0.5 * (1 + node) * path, 0.5 * weight) for node, weight in zip(nodes, weights, strict=True)]
+    a = np.hypot(distance, dx)
+    upper, lower = (half + reach) / a, (half - reach) / a
+    both = np.arctan(upper) + np.arctan(lower)
+    with np.errstate(invalid="ignore"):
+        apart = np.arctan2(2 * reach / a, 1 + upper * lower) / np.where(reach > 0, reach, 1.0)
+    apart = np.where(reach > 0, apart, 2 * a / (a * a + half * half))
+    mean: Array = 0.5 * (distance / a) ** 2 / a * (half * apart + both)
+    return mean

@@ -9,7 +9,7 @@ from scipy.integrate import quad
 from wallmirror import CaptureSet, Card, Diffuse, GaussianTrain, Observer, Room, Sum, radiance, solve, transport_matrix
 from wallmirror.interreflection import _through_wall, directional_albedo, from_card, from_room
 
-OBSERVER = Observer(position=(0.0, -5.0), fov=math.radians(60), view_angles=(0.15, -0.15), pixels=40)
+OBSERVER = Observer(position=(0.0, -5.0), fov=math.radians(60), view_angles=(0.25, 0.08, -0.08, -0.25), pixels=100)
 SATIN = Sum(
     parts=(
         GaussianTrain(centres=(-0.4, 0.0, 0.5), sigma=math.radians(5), scale=0.3),

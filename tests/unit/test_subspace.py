@@ -320,7 +320,9 @@ class Ripple(AngleSumBRDF):
         return 1 + 0.5 * np.cos(2 * np.asarray(u, dtype=np.float64))
 
 
-@pytest.mark.parametrize(("distance", "noise"), [(1000.0, 0.0), (300.0, 0.0), (300.0, 1e-6), (300.0, 1e-7), (1000.0, 1e-7)])
+@pytest.mark.parametrize(
+    ("distance", "noise"), [(1000.0, 0.0), (300.0, 0.0), (300.0, 1e-6), (300.0, 1e-7), (1000.0, 1e-7)]
+)
 @pytest.mark.parametrize("method", ["auto", "maximum_likelihood"])
 def test_parallax_lost_in_rounding_or_noise_is_not_answered_with_confidence(
     distance: float, noise: float, method: Method

@@ -77,20 +77,30 @@ def cramer_rao(data: Moments, coefficients: Array, source: Array, *, gauge: Arra
     strength = float(np.trace(schur)) / max(1, schur.shape[0]) / max(float(c @ c), 1e-300)
     pinned = schur + strength * np.outer(c, c)
     # Barely seen cells: a ridge far below their neighbours' information keeps their (huge) variance finite.
-    ridge = 1e-12 * float(np.trace(schur)) / max(1, schur.shape[0])
-    pinned[np.diag_indices_from(pinned)] += ridge
-    factor = sl.cho_factor(pinned, lower=True, check_finite=False)
-    covariance = sl.cho_solve(factor, np.eye(pinned.shape[0]), check_finite=False)
+    # And no ridge below the rounding of S, which subtracts C^T H^-1 C with the condition of H.
+    lost = max(1e-12, 4 * np.finfo(np.float64).eps * float(np.max(np.linalg.cond(inverse))))
+    ridge = lost * float(np.trace(schur)) / max(1, schur.shape[0])
     along = float(c @ r)
-    if along != 0:
-        covariance -= np.outer(r, r) / (strength * along**2)
-    covariance = 0.5 * (covariance + covariance.T)
+
+    def invert(ridge: float) -> Array:
+        identity = np.eye(pinned.shape[0])
+        factor = sl.cho_factor(pinned + ridge * identity, lower=True, check_finite=False)
+        covariance = sl.cho_solve(factor, identity, check_finite=False)
+        if along != 0:
+            covariance -= np.outer(r, r) / (strength * along**2)
+        return np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)
+
+    covariance = invert(ridge)
+    error = _scale_free_error(source, inverse, coupled, covariance)
+    # What the ridge alone holds, nothing holds: a bound on V that falls with it is none.
+    if lost > 1e-3 or _scale_free_error(source, inverse, coupled, invert(10 * ridge)) < 0.8 * error:
+        error = float("inf")
     variance = np.einsum("bii->bi", inverse) + np.einsum("bik,kl,bil->bi", coupled, covariance, coupled, optimize=True)
     return Bound(
         coefficients=covariance,
         seen=seen,
         source_std=np.sqrt(np.maximum(variance, 0.0)).T,
-        source_error=_scale_free_error(source, inverse, coupled, covariance),
+        source_error=error,
     )
 
 

@@ -18,16 +18,20 @@ Non-negativity turns each step into a convex quadratic programme, solved by bloc
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg as sl
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from wallmirror.errors import UndeterminedError
+
 Array = NDArray[np.float64]
 
 # Cells whose Fisher information lies this far below the best-seen cell's are left out of the fit.
 _SEEN = 1e-10
+_WEAK = 1e-4
 _RIDGE = 1e-12
 _PIVOTS = 20
 
@@ -66,14 +70,19 @@ class Moments:
         """K."""
         return int(self.cross.shape[2])
 
+    @cached_property
+    def exposure(self) -> Array:
+        """How well each coefficient is seen, relative to the best-seen one, shape (K,)."""
+        total = np.zeros(self.size)
+        for grams in self.grams:
+            for i in range(self.elements):
+                total += grams[i, i].diagonal()
+        return total / max(float(total.max(initial=0.0)), 1e-300)
+
     @property
     def seen(self) -> NDArray[np.bool_]:
         """Which coefficients the captures see at all, shape (K,)."""
-        information = np.zeros(self.size)
-        for grams in self.grams:
-            for i in range(self.elements):
-                information += grams[i, i].diagonal()
-        return np.asarray(information > _SEEN * information.max(initial=0.0))
+        return np.asarray(self.exposure > _SEEN)
 
 
 @dataclass(frozen=True)
@@ -165,10 +174,9 @@ def maximise(
         Stop when a full step promises to change the objective by less than this share.
     """
     seen = data.seen
-    begins = (np.where(seen, np.maximum(r, 0.0) if nonnegative else r, 0.0) for r in starts)
-    state = min(
-        (_evaluate(data, r, None, nonnegative=nonnegative) for r in begins), key=lambda candidate: candidate.objective
-    )
+    begins = (np.where(seen, _clipped(data, r) if nonnegative else r, 0.0) for r in starts)
+    states = (_evaluate(data, r, None, nonnegative=nonnegative) for r in begins)
+    state = min(states, key=lambda candidate: candidate.objective)
     rounding = 1e-14 * float(np.sum(data.energy))
     for iteration in range(1, max_iterations + 1):
         dr, slope = _step(data, state, seen, nonnegative=nonnegative)
@@ -199,6 +207,38 @@ def information(data: Moments, coefficients: Array, source: Array) -> tuple[Arra
     return gram, inverse, coupled
 
 
+def best_nonnegative(data: Moments, source: Array) -> Array:
+    """The r >= 0 of largest likelihood for a given pattern V >= 0 of shape (M, B): a convex problem, shape (K,)."""
+    v = np.maximum(source.T if source.sum() > 0 else -source.T, 0.0)
+    cells = np.flatnonzero(data.seen)
+    gram = _gram_of_source(data, v)[np.ix_(cells, cells)]
+    gram[np.diag_indices_from(gram)] += _RIDGE * float(np.trace(gram)) / max(1, cells.size)
+    r = np.zeros(data.size)
+    r[cells] = _step_above(np.zeros(cells.size), gram, np.einsum("bi,bik->k", v, data.cross)[cells])
+    return r
+
+
+def _gram_of_source(data: Moments, v: Array) -> Array:
+    """sum_b J_b^T W J_b, dense (K, K), for v of shape (B, M)."""
+    total = np.zeros((data.size, data.size))
+    for g, grams in enumerate(data.grams):
+        rows = v[data.group == g]
+        products = rows.T @ rows
+        for (i, j), gram in grams.items():
+            coo = gram.tocoo()
+            row, column = coo.coords
+            total[row, column] += products[i, j] * coo.data
+            if i != j:
+                total[column, row] += products[i, j] * coo.data
+    return total
+
+
+def _clipped(data: Moments, r: Array) -> Array:
+    """The nearest non-negative start; cells seen weakly, where noise is all, are capped by the well-seen ones."""
+    weak = data.exposure < _WEAK
+    return np.clip(r, 0.0, np.where(weak, np.max(r[~weak], initial=0.0), np.inf))
+
+
 def _fit(state: _State, iterations: int, *, converged: bool) -> Fit:
     return Fit(state.r, state.v.T.copy(), state.objective, iterations, converged)
 
@@ -214,7 +254,8 @@ def _evaluate(data: Moments, r: Array, v: Array | None, *, nonnegative: bool) ->
     normal = pair @ r
     moment = data.cross @ r  # (B, M)
     if v is None:
-        ridge = 1e-14 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(m)
+        level = 1e-14 * np.trace(normal, axis1=1, axis2=2) + 1e-290  # an rho of 0 gives V = 0
+        ridge = level[:, None, None] * np.eye(m)
         v = np.linalg.solve((normal + ridge)[data.group], moment[..., None])[..., 0]
         if nonnegative:
             for b in np.flatnonzero(np.any(v < 0, axis=1)):
@@ -277,27 +318,26 @@ def _step_above(floor: Array, quadratic: Array, linear: Array) -> Array:
 
 
 def _solve_positive(matrix: Array, right: Array) -> Array:
-    """Cholesky, several times faster than `scipy.linalg.solve`, which also estimates the condition."""
-    factor = sl.cho_factor(matrix, lower=True, check_finite=False)
-    return np.asarray(sl.cho_solve(factor, right, check_finite=False), dtype=np.float64)
+    """Cholesky, several times faster than `scipy.linalg.solve`, which also estimates the condition.
+
+    A matrix that rounding has robbed of its smallest eigenvalues gets a larger ridge.
+    """
+    for ridge in (0.0, 1e-11, 1e-9, 1e-7):
+        try:
+            raised = matrix + ridge * np.mean(np.diag(matrix)) * np.eye(matrix.shape[0]) if ridge else matrix
+            factor = sl.cho_factor(raised, lower=True, check_finite=False)
+            return np.asarray(sl.cho_solve(factor, right, check_finite=False), dtype=np.float64)
+        except np.linalg.LinAlgError:
+            continue
+    raise UndeterminedError("the captures leave the pattern undetermined; capture more light, views or patterns")
 
 
 def _schur(
     data: Moments, state: _State, free: NDArray[np.bool_], cells: NDArray[np.intp]
 ) -> tuple[Array, Array, Array]:
     """S on the given cells, and H_b^-1, H_b^-1 C_b with the rows of fixed source entries zero."""
-    m, size = data.elements, data.size
-    total = np.zeros((size, size))
-    for g, grams in enumerate(data.grams):
-        v = state.v[data.group == g]
-        products = v.T @ v
-        for (i, j), gram in grams.items():
-            coo = gram.tocoo()
-            row, column = coo.coords
-            if products[i, j] != 0:
-                total[row, column] += products[i, j] * coo.data
-                if i != j:
-                    total[column, row] += products[i, j] * coo.data
+    m = data.elements
+    total = _gram_of_source(data, state.v)
     normal = state.normal[data.group].copy()
     both = free[:, :, None] & free[:, None, :]
     normal = np.where(both, normal, np.eye(m) * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-300)

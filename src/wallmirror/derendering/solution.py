@@ -26,6 +26,8 @@ _UNDETERMINED = 0.5
 _CURVE_NODES = 2401
 # A bias beyond this share of the error bars is told.
 _BIAS_TOLD = 0.5
+# Below this the closed form's gap is as good as none.
+_NO_GAP = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +149,8 @@ def conclude(
         When several BRDFs explain the data alike, or the error bars are as large as the pattern.
     """
     closed, grid = estimate.closed, estimate.grid
-    if estimate.method == "closed_form" and closed.near_solutions > 1:
+    # A gap of rounding's size leaves the fit nothing to choose by, and its error bars no way to know.
+    if closed.near_solutions > 1 and (estimate.method == "closed_form" or closed.gap < _NO_GAP):
         raise UndeterminedError(
             f"{closed.near_solutions} different BRDFs explain the captures equally well (gap {closed.gap:.1e}); use a "
             "card or views whose reflections share more angles"
@@ -157,10 +160,10 @@ def conclude(
             f"the captures leave the pattern undetermined (its error bars come to {100 * estimate.predicted_error:.0f} "
             "% of it); capture more light, more views or more patterns"
         )
-    peak_at = grid.peak(estimate.coefficients)
-    peak = float(grid.evaluate(estimate.coefficients, peak_at))
-    # Samples that include the peak, so that the curve's maximum is 1 to rounding.
-    u = np.unique(np.append(np.linspace(grid.start, grid.stop, _CURVE_NODES), peak_at))
+    # Samples that include the peak; the largest of them is the gauge.
+    u = np.unique(np.append(np.linspace(grid.start, grid.stop, _CURVE_NODES), grid.peak(estimate.coefficients)))
+    curve = grid.evaluate(estimate.coefficients, u)
+    peak = float(curve.max())
     views, pixels, _ = problem.captures.radiance.shape
     missed = np.linalg.norm(problem.data - estimate.transport @ estimate.source)
     warnings = list(estimate.warnings)
@@ -186,7 +189,7 @@ def conclude(
         source=estimate.source * peak * problem.scale,
         source_std=estimate.source_std * peak * problem.scale,
         angle_sum=u,
-        brdf=grid.evaluate(estimate.coefficients, u) / peak,
+        brdf=curve / peak,
         brdf_std=estimate.brdf_std(u) / peak,
         transport=(estimate.transport / peak).reshape(views, pixels, -1),
         rank=space.rank,

@@ -20,13 +20,13 @@ from threadpoolctl import threadpool_limits
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.bounds import cramer_rao
 from wallmirror.derendering.estimate import Estimate
-from wallmirror.derendering.likelihood import Fit, Moments, maximise, moments
+from wallmirror.derendering.likelihood import Fit, Moments, best_nonnegative, maximise, moments
 from wallmirror.derendering.one_bounce import check_one_bounce
 from wallmirror.derendering.problem import Problem, prepare
 from wallmirror.derendering.solution import Solution, conclude
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form
-from wallmirror.errors import InputError
+from wallmirror.errors import InputError, UndeterminedError
 
 Array = NDArray[np.float64]
 
@@ -143,6 +143,26 @@ def _closed_form(problem: Problem, space: SignalSpace, steps: tuple[float, ...])
     )
 
 
+def _fit(summed: Moments, starts: list[Array], nonnegative: bool) -> Fit:
+    """The maximum of the likelihood; with bounds, the best of those reached from the free maximum and the starts.
+
+    Clipping a start can throw it into the valley of another maximum, so the first start is the best rho >= 0 for the
+    free maximum's pattern. The free maximum also tells whether the bounds are reached well: where the truth keeps
+    them they cost about one unit of noise variance a coefficient, not more.
+    """
+    free = maximise(summed, *starts, nonnegative=False)
+    if not nonnegative:
+        return free
+    noise = free.objective / max(1, summed.observations - summed.size)
+    acceptable = free.objective + 3 * summed.size * noise
+    bounded: list[Fit] = []
+    for start in (best_nonnegative(summed, free.source), *starts):
+        bounded.append(maximise(summed, start))
+        if bounded[-1].objective <= acceptable:
+            break
+    return min(bounded, key=lambda fit: fit.objective)
+
+
 def _maximum_likelihood(
     problem: Problem,
     space: SignalSpace,
@@ -160,7 +180,12 @@ def _maximum_likelihood(
         starts = [closed.coefficients]
         if best is not None:
             starts.append(grid.interpolate(partial(best[0].evaluate, best[3].coefficients)))
-        fit = maximise(summed, *starts, nonnegative=nonnegative)
+        try:
+            fit = _fit(summed, starts, nonnegative)
+        except UndeterminedError:
+            if best is None:
+                raise
+            break  # so fine a grid has cells that nothing determines
         tell(f"knots every {step:g} deg: misfit {fit.objective:.6g} after {fit.iterations} steps")
         if best is not None:
             variance = 1.0 if problem.noise_is_stated else fit.objective / max(1, summed.observations - summed.size)

@@ -52,7 +52,7 @@ class ClosedForm:
     Parameters
     ----------
     coefficients:
-        r, shape (K,), with the sign that makes its sum positive.
+        r, shape (K,), with the sign that makes the pattern's sum positive.
     transport:
         F = U W, shape (P, M).
     source:
@@ -117,8 +117,6 @@ def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) ->
     factor = _banded_cholesky(sum_of_grams(designs))
     values, leading = _leading_pairs(stacked, factor, len(designs))
     r = sl.cho_solve_banded((factor, True), stacked.T @ leading)
-    if r.sum() < 0:
-        r = -r
     projected = (stacked @ r).reshape(len(designs), -1).T  # W, (M, M): column i is U^T T_i r
     norm, missed = 0.0, 0.0
     for i, t in enumerate(designs):
@@ -128,12 +126,16 @@ def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) ->
         norm += float(column @ column)
     mismatch = missed / norm if norm > 0 else 1.0
     scale = 1 / math.sqrt(norm) if norm > 0 else 1.0
+    # W is singular where an element has no part in r.
+    source = np.linalg.lstsq(projected * scale, u.T @ data)[0]
+    if source.sum() < 0:  # the light is positive; r itself may be ruled by cells that hardly anybody saw
+        scale, source = -scale, -source
     lost = 1 - values
     near = int(np.count_nonzero(lost < 100 * max(mismatch, 1e-15 * size)))
     return ClosedForm(
         coefficients=r * scale,
         transport=(u @ projected) * scale,
-        source=np.linalg.solve(projected * scale, u.T @ data),
+        source=source,
         mismatch=mismatch,
         gap=float(lost[1]) if lost.size > 1 else 1.0,
         near_solutions=max(1, near),

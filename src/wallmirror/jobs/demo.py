@@ -30,7 +30,7 @@ Stage = Callable[[str], Any]
 
 @dataclass(frozen=True)
 class Size:
-    """How much the demo renders: views of the main scene and of the others, pixels, samples, picture width."""
+    """How much the demo renders: views of the main scene and of the others, pixels, samples, pictures."""
 
     views: int
     other_views: int
@@ -38,12 +38,13 @@ class Size:
     spp: int
     validation_spp: int
     picture_width: int
+    picture_spp: int
     others: tuple[str, ...]
 
 
-FULL = Size(20, 10, 500, 1024, 256, 640, ("cornell_lobes", "reflective_card"))
+FULL = Size(20, 10, 500, 1024, 256, 640, 64, ("cornell_lobes", "reflective_card"))
 #: Without LLVM one sample costs about a thousand times more.
-REDUCED = Size(3, 0, 40, 64, 8, 96, ())
+REDUCED = Size(3, 0, 40, 64, 8, 64, 2, ())
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,7 @@ def run_demo(out: Path, *, seed: int = 0, stage: Stage, tell: Callable[[str], No
         scenes = {run.scene.name: run.scene for run in runs}
         for number, (name, scene) in enumerate(scenes.items(), 1):
             width = size.picture_width
-            pictures[name] = picture(scene, width, width * 9 // 16, spp=64, variant=runtime.variant)
+            pictures[name] = picture(scene, width, width * 9 // 16, spp=size.picture_spp, variant=runtime.variant)
             advance(number, len(scenes))
     report = out / "report.html"
     demo = Demo(runtime, validation, tuple(runs), report, time.perf_counter() - started)
