@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from wallmirror.brdf import AngleSumBRDF
 from wallmirror.geometry import Card, Observer, outgoing_angles, pixel_tangents, wall_points
 from wallmirror.scene import Room
-from wallmirror.transport import build_kernel
+from wallmirror.transport import build_kernel, strip_factor
 
 Array = NDArray[np.float64]
 
 _COLUMNS = 24
-_ROWS = 4
+_ROWS = 8
 _WALL_NODES = 1500
 
 
@@ -78,12 +78,20 @@ def from_card(observer: Observer, card: Card, brdf: AngleSumBRDF, source: Array)
     from_strips = _through_wall(x, h, strips, np.zeros(strips.size), card.distance, brdf) * strip_area
     back = card.albedo / math.pi
     reflected = np.linalg.solve(np.eye(x.size) - back * among, back * from_strips @ source)
-    profile = np.tensordot(shares, reflected.reshape(_COLUMNS, _ROWS, -1), axes=(0, 1))
     board = Card(elements_x=tuple(columns), y=card.y, element_width=pitch * (1 - 1e-9), element_height=height)
     # A glowing board blurs whatever is finer than its columns.
     scale = max(brdf.angular_scale, math.atan(pitch / card.distance) / 4)
     kernel = build_kernel(observer, board, resolution=scale, tolerance=1e-2)
-    return np.asarray(kernel.apply(brdf) @ profile, dtype=np.float64)
+    a = card.distance / np.cos(kernel.theta_s)
+    flat = kernel.weight * brdf.of_sum(kernel.angle_sum)
+    flat /= strip_factor(card.distance, card.distance * np.tan(kernel.theta_s), -height / 2, height / 2)
+    glow = reflected.reshape(_COLUMNS, _ROWS, -1)
+    seen = np.zeros(shape)
+    for row in range(_ROWS):
+        # The board's glow fades with height, and so does what it sends to the wall's middle: each row by itself.
+        factor = shares[row] * height * card.distance**2 / (a * a + rows[row] ** 2) ** 2
+        seen += np.sum(flat * factor, axis=-1) @ glow[:, row]
+    return seen
 
 
 def _through_wall(x_q: Array, h_q: Array, x_s: Array, h_s: Array, z: float, brdf: AngleSumBRDF) -> Array:

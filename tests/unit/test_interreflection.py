@@ -135,8 +135,8 @@ def test_bias_is_foretold_and_told_where_the_card_reflects():
         return np.linalg.norm(scale * solution.source - source) / np.linalg.norm(source)
 
     assert off(clean) < 2 * clean.predicted_error
-    assert off(biased) > 3 * biased.predicted_error  # its own error bars do not cover it,
-    assert 0.5 < biased.one_bounce.bias / off(biased) < 2  # the check does,
+    assert off(biased) > 5 * off(clean)  # the card's light did turn the pattern,
+    assert 0.5 < biased.one_bounce.bias / off(biased) < 2  # the check foretells by how much,
     assert biased.verdict == "doubtful"  # and the status says so.
     assert "Hypothesis 2" in biased.status
 

@@ -44,7 +44,7 @@ class Size:
 
 FULL = Size(20, 10, 500, 1024, 256, 640, 64, ("cornell_lobes", "reflective_card"))
 #: Without LLVM one sample costs about a thousand times more.
-REDUCED = Size(3, 0, 40, 64, 8, 64, 2, ())
+REDUCED = Size(4, 0, 48, 512, 4, 64, 2, ())
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def run_demo(out: Path, *, seed: int = 0, stage: Stage, tell: Callable[[str], No
     runtime = activate()
     size = REDUCED if runtime.reduced else FULL
     if runtime.reduced:
-        tell(f"{runtime.advice} Going on with {runtime.variant} on a much smaller job.")
+        tell(f"{runtime.advice}; going on with a much smaller job")
     main = _sized(load_scene("flat_wall_lobes"), size, size.views)
     runs = [_run(main, 2, out, size, seed, runtime, stage)]
     with stage("comparing with the analytic model") as advance:

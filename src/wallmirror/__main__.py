@@ -1,0 +1,5 @@
+"""`python -m wallmirror`."""
+
+from wallmirror.cli import main
+
+main()
