@@ -33,12 +33,14 @@ Array = NDArray[np.float64]
 Method = Literal["auto", "closed_form", "maximum_likelihood"]
 
 #: Knot spacings in degrees, tried in turn while finer ones still pay.
-_EXACT_STEPS = (1.0, 0.25, 0.0625)
+_EXACT_STEPS = (1.0, 0.125, 0.03125)
 _NOISY_STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
 _EXACT_DEGREE = 7
 _NOISY_DEGREE = 3
 # Below this mismatch the data count as free of noise: float64 renders end near 1e-24, float32 files near 1e-13.
 _NOISELESS = 1e-15
+# At this mismatch rounding is all that is left: finer knots could only add to it.
+_EXACT = 3e-23
 
 
 def solve(
@@ -102,7 +104,7 @@ def solve(
 
 
 def _closed_form(problem: Problem, space: SignalSpace, steps: tuple[float, ...]) -> Estimate:
-    """Quarter the knot spacing while the mismatch falls to a third, then try the spacing halfway."""
+    """Refine the knots while the mismatch falls to a third and is above rounding, then try a spacing in between."""
 
     def at(step: float) -> tuple[SplineGrid, ClosedForm, list[sp.csr_array]]:
         grid, designs = problem.designs(step, degree=_EXACT_DEGREE, tolerance=1e-9)
@@ -110,6 +112,8 @@ def _closed_form(problem: Problem, space: SignalSpace, steps: tuple[float, ...])
 
     grid, closed, designs = at(steps[0])
     for step in steps[1:]:
+        if closed.mismatch < _EXACT:
+            break
         finer = at(step)
         if finer[1].mismatch > closed.mismatch / 3:
             halfway = at(2 * step)
