@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 Method = Literal["auto", "closed_form", "maximum_likelihood"]
 
 #: Knot spacings in degrees, tried in turn while finer ones still pay.
-_EXACT_STEPS = (1.0, 0.125, 0.03125)
+_EXACT_STEPS = (1.0, 0.25, 0.125, 0.0625, 0.03125)
 _NOISY_STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
 _EXACT_DEGREE = 7
 _NOISY_DEGREE = 3
@@ -104,7 +104,7 @@ def solve(
 
 
 def _closed_form(problem: Problem, space: SignalSpace, steps: tuple[float, ...]) -> Estimate:
-    """Refine the knots while the mismatch falls to a third and is above rounding, then try a spacing in between."""
+    """Refine the knots while that halves the error bound and rounding is not reached, then try a spacing in between."""
 
     def at(step: float) -> tuple[SplineGrid, ClosedForm, list[sp.csr_array]]:
         grid, designs = problem.designs(step, degree=_EXACT_DEGREE, tolerance=1e-9)
@@ -115,9 +115,10 @@ def _closed_form(problem: Problem, space: SignalSpace, steps: tuple[float, ...])
         if closed.mismatch < _EXACT:
             break
         finer = at(step)
-        if finer[1].mismatch > closed.mismatch / 3:
+        # Not the mismatch alone: a grid finer than the pixels fits anything, and its gap says so.
+        if finer[1].error > closed.error / 2:
             halfway = at(2 * step)
-            if halfway[1].mismatch < closed.mismatch / 3:
+            if halfway[1].error < closed.error / 2:
                 grid, closed, designs = halfway
             break
         grid, closed, designs = finer
@@ -127,8 +128,7 @@ def _closed_form(problem: Problem, space: SignalSpace, steps: tuple[float, ...])
             f"the closed form misses the data by {math.sqrt(closed.mismatch):.1e}: there is noise or the geometry is "
             "off, and maximum likelihood would do better",
         )
-    # The subspace turns by at most sqrt(mismatch) / gap, and with it pattern and BRDF (Davis and Kahan 1970).
-    error = math.sqrt(closed.mismatch) / max(closed.gap, 1e-300) + 1e-15
+    error = closed.error
     weights = problem.row_weights
     transport = np.stack([t @ closed.coefficients for t in designs], axis=1)
     np.divide(closed.transport, weights, out=transport, where=weights > 0)

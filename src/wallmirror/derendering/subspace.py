@@ -74,6 +74,11 @@ class ClosedForm:
     near_solutions: int
     mixing_condition: float
 
+    @property
+    def error(self) -> float:
+        """Bound on the relative error of V: the eigenvector turns by at most sqrt(mismatch) / gap (Davis, Kahan 1970)."""
+        return math.sqrt(self.mismatch) / max(self.gap, 1e-300) + 1e-15
+
 
 def signal_space(data: Array, elements: int, *, noise_floor: float = 0.0) -> SignalSpace:
     """U and the rank of the data, both from one QR and one small SVD.
