@@ -119,7 +119,7 @@ def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) ->
     u = space.basis
     size = designs[0].shape[1]
     stacked = np.concatenate([(t.T @ u).T for t in designs])  # H, (M^2, K); rows i*M..i*M+M-1 belong to T_i
-    factor = _banded_cholesky(sum_of_grams(designs))
+    factor = _banded_cholesky(banded_gram(designs))
     values, leading = _leading_pairs(stacked, factor, len(designs))
     r = sl.cho_solve_banded((factor, True), stacked.T @ leading)
     projected = (stacked @ r).reshape(len(designs), -1).T  # W, (M, M): column i is U^T T_i r
@@ -148,20 +148,37 @@ def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) ->
     )
 
 
-def sum_of_grams(designs: list[sp.csr_array]) -> sp.csr_array:
-    """A = sum_i T_i^T T_i, sparse (K, K)."""
-    stacked = sp.vstack(designs, format="csr")
-    return sp.csr_array(stacked.T @ stacked)
+def banded_gram(designs: list[sp.csr_array]) -> Array:
+    """Lower band of A = sum_i T_i^T T_i, shape (w, K): entry [d, k] is A[k + d, k].
+
+    The rows of a design matrix are runs of equal length, so that the band sums up without a sparse product.
+    """
+    size = designs[0].shape[1]
+    widths = [t.nnz // t.shape[0] for t in designs]
+    if any(np.any(np.diff(t.indptr) != w) or w == 0 for t, w in zip(designs, widths, strict=True)):
+        return _band_of(sp.csr_array(sum(t.T @ t for t in designs)))
+    band = np.zeros((max(widths), size))
+    for t, width in zip(designs, widths, strict=True):
+        data, first = t.data.reshape(-1, width), t.indices[::width]
+        for d in range(width):
+            products = data[:, : width - d] * data[:, d:]
+            columns = first[:, None] + np.arange(width - d)
+            band[d] += np.bincount(columns.ravel(), weights=products.ravel(), minlength=size)
+    return band
 
 
-def _banded_cholesky(gram: sp.csr_array) -> Array:
-    """Lower banded Cholesky factor of A plus a ridge that only cells without data feel."""
+def _band_of(gram: sp.csr_array) -> Array:
     coo = gram.tocoo()
     row, column = coo.coords
-    bandwidth = int(np.max(np.abs(row - column), initial=0))
-    band = np.zeros((bandwidth + 1, gram.shape[0]))
+    band = np.zeros((int(np.max(np.abs(row - column), initial=0)) + 1, gram.shape[0]))
     lower = row >= column
     band[(row - column)[lower], column[lower]] = coo.data[lower]
+    return band
+
+
+def _banded_cholesky(band: Array) -> Array:
+    """Lower banded Cholesky factor of A plus a ridge that only cells without data feel."""
+    band = band.copy()
     band[0] += _RIDGE * band[0].max()
     return np.asarray(sl.cholesky_banded(band, lower=True), dtype=np.float64)
 
