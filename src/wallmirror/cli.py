@@ -80,16 +80,22 @@ def validate(
         list[str] | None, typer.Argument(help="Scene names or .toml files; all of ours if left out.")
     ] = None,
     out: Out = Path("out/validate"),
-    views: Annotated[int, typer.Option(min=1, help="Views of each scene to compare.")] = 5,
-    spp: Annotated[int, typer.Option(min=4, max=1024, help="Samples per pixel of each of the 32 seeds.")] = 256,
+    views: Annotated[int | None, typer.Option(min=1, help="Views of each scene to compare: 8, or 3 if quick.")] = None,
+    spp: Annotated[
+        int | None,
+        typer.Option(min=4, max=1024, help="Samples per pixel of each of the 32 seeds: 256, or 64 if quick."),
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer views and samples: sees only larger faults.")] = False,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> None:
     """Test the analytic one-bounce model against Mitsuba, scene by scene, and say what bias would have shown."""
-    from wallmirror.jobs.validating import validate_scenes, verdict
+    from wallmirror.jobs.validating import QUICK_SPP, QUICK_VIEWS, SPP, VIEWS, validate_scenes, verdict
     from wallmirror.scene import load_scene, scene_names
 
     terminal = Terminal(as_json=as_json)
+    views = views or (QUICK_VIEWS if quick else VIEWS)
+    spp = spp or (QUICK_SPP if quick else SPP)
     loaded = [load_scene(name) for name in (scenes or scene_names())]
     with terminal.progress("validating") as advance:
         results = validate_scenes(loaded, out, views=views, spp=spp, seed=seed, progress=advance)

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -17,6 +17,11 @@ from rich.table import Table
 Advance = Callable[[int, int], None]
 
 _PLAIN_INTERVAL = 5.0
+
+
+def _console(stream: TextIO) -> Console:
+    """Wide where nobody watches, so that tables in files keep their rows on one line."""
+    return Console(file=stream, highlight=False, soft_wrap=True, width=None if stream.isatty() else 160)
 
 
 class Terminal:
@@ -30,8 +35,8 @@ class Terminal:
 
     def __init__(self, *, as_json: bool = False) -> None:
         self.as_json = as_json
-        self._out = Console(file=sys.stderr if as_json else sys.stdout, highlight=False, soft_wrap=True)
-        self._err = Console(file=sys.stderr, highlight=False, soft_wrap=True)
+        self._out = _console(sys.stderr if as_json else sys.stdout)
+        self._err = _console(sys.stderr)
 
     def say(self, text: str = "", *, style: str | None = None) -> None:
         """A line of the result for people."""

@@ -27,8 +27,9 @@ from wallmirror.transport import build_kernel, strip_factor
 
 Array = NDArray[np.float64]
 
-_COLUMNS = 24
-_ROWS = 8
+# Nodes on the card: at least, per distance from the wall (over which the board's glow varies), and at most.
+_COLUMNS = (24, 2, 64)
+_ROWS = (8, 2, 24)
 _WALL_NODES = 1500
 
 
@@ -64,13 +65,14 @@ def from_card(observer: Observer, card: Card, brdf: AngleSumBRDF, source: Array)
     if card.albedo == 0 or card.is_points or width <= 0 or height <= 0:
         return np.zeros(shape)
     middle = 0.5 * (max(card.elements_x) + min(card.elements_x)) if not card.board_width else 0.0
-    pitch = width / _COLUMNS
-    columns = middle + (np.arange(_COLUMNS) + 0.5) * pitch - width / 2
-    nodes, shares = np.polynomial.legendre.leggauss(_ROWS)
+    across, high = _nodes(_COLUMNS, width / card.distance), _nodes(_ROWS, height / card.distance)
+    pitch = width / across
+    columns = middle + (np.arange(across) + 0.5) * pitch - width / 2
+    nodes, shares = np.polynomial.legendre.leggauss(high)
     rows, shares = nodes * height / 2, shares / 2
-    x = np.repeat(columns, _ROWS)
-    h = np.tile(rows, _COLUMNS)
-    area = pitch * height * np.tile(shares, _COLUMNS)
+    x = np.repeat(columns, high)
+    h = np.tile(rows, across)
+    area = pitch * height * np.tile(shares, across)
     strips = np.asarray(card.elements_x)
     strip_area = card.element_width * card.element_height
     # Irradiance at node q per radiance of source s, both through one reflection on the wall.
@@ -85,37 +87,40 @@ def from_card(observer: Observer, card: Card, brdf: AngleSumBRDF, source: Array)
     a = card.distance / np.cos(kernel.theta_s)
     flat = kernel.weight * brdf.of_sum(kernel.angle_sum)
     flat /= strip_factor(card.distance, card.distance * np.tan(kernel.theta_s), -height / 2, height / 2)
-    glow = reflected.reshape(_COLUMNS, _ROWS, -1)
+    glow = reflected.reshape(across, high, -1)
     seen = np.zeros(shape)
-    for row in range(_ROWS):
+    for row in range(high):
         # The board's glow fades with height, and so does what it sends to the wall's middle: each row by itself.
         factor = shares[row] * height * card.distance**2 / (a * a + rows[row] ** 2) ** 2
         seen += np.sum(flat * factor, axis=-1) @ glow[:, row]
     return seen
 
 
+def _nodes(rule: tuple[int, int, int], distances: float) -> int:
+    least, per_distance, most = rule
+    return min(most, max(least, math.ceil(per_distance * distances)))
+
+
 def _through_wall(x_q: Array, h_q: Array, x_s: Array, h_s: Array, z: float, brdf: AngleSumBRDF) -> Array:
     """int rho cos^2 cos^2 / (r^2 r^2) dA over the wall for each pair of card points, (Q, S), in 1/m^2."""
-    middle = 0.5 * (x_q.min() + x_q.max())
     edges = np.linspace(-math.pi / 2, math.pi / 2, _WALL_NODES + 1)
     phi = 0.5 * (edges[1:] + edges[:-1])
-    wall = middle + z * np.tan(phi)
     step = z / np.cos(phi) ** 2 * (edges[1] - edges[0])
-    unique_q, q_of = np.unique(x_q, return_inverse=True)
-    unique_s, s_of = np.unique(x_s, return_inverse=True)
+    # The wall has no end and the angles' sum no order: only distances count.
+    apart, x_of = np.unique(np.abs(x_q[:, None] - x_s[None, :]).round(12), return_inverse=True)
     heights, d_of = np.unique(np.abs(h_q[:, None] - h_s[None, :]).round(12), return_inverse=True)
-    table = np.empty((unique_q.size, unique_s.size, heights.size))
-    for i, xq in enumerate(unique_q):
-        a = np.hypot(z, xq - wall)
-        b = np.hypot(z, unique_s[:, None] - wall)
-        u = np.arctan((xq - wall) / z) + np.arctan((unique_s[:, None] - wall) / z)
-        weight = brdf.of_sum(u) * step * z**4 * math.pi / (4 * a**3 * b**3)
-        c = a + b
-        for k, d in enumerate(heights):
-            s = c * c + d * d
-            bracket = c / s + c * (c * c - d * d) / s**2 + 2 * a * b * (c**3 - 3 * c * d * d) / s**3
-            table[i, :, k] = np.sum(weight * bracket, axis=-1)
-    return np.asarray(table[q_of[:, None], s_of[None, :], d_of.reshape(x_q.size, x_s.size)], dtype=np.float64)
+    left = -apart[:, None] / 2 - z * np.tan(phi)
+    right = apart[:, None] / 2 - z * np.tan(phi)
+    a, b = np.hypot(z, left), np.hypot(z, right)
+    weight = brdf.of_sum(np.arctan(left / z) + np.arctan(right / z)) * step * z**4 * math.pi / (4 * a**3 * b**3)
+    c = a + b
+    table = np.empty((apart.size, heights.size))
+    for k, d in enumerate(heights):
+        s = c * c + d * d
+        bracket = c / s + c * (c * c - d * d) / s**2 + 2 * a * b * (c**3 - 3 * c * d * d) / s**3
+        table[:, k] = np.sum(weight * bracket, axis=-1)
+    pairs = (x_q.size, x_s.size)
+    return np.asarray(table[x_of.reshape(pairs), d_of.reshape(pairs)], dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -130,16 +135,17 @@ class _Patches:
 def from_room(observer: Observer, card: Card, room: Room, brdf: AngleSumBRDF, source: Array) -> Array:
     """Radiance that reaches the camera over the room's surfaces and then the wall, (A, N, B); an estimate.
 
-    Strips light the patches directly and over the wall; patches light each other (radiosity) and the wall. Light that
-    meets the wall three times is left out, so the estimate is low by about the wall's albedo squared.
+    Strips light the patches directly and over the wall; patches light each other (radiosity), directly and over the
+    wall, and then the wall. The card casts no shadow here.
     """
     patches = _room_patches(room)
     strips = np.stack([np.asarray(card.elements_x), np.full(card.elements, card.y), np.zeros(card.elements)], axis=1)
     strip_area = 1.0 if card.is_points else card.element_width * card.element_height
     lit = _exchange(patches, strips, np.array([0.0, 1.0, 0.0])) * strip_area
-    lit = lit + _over_wall(patches, strips, strip_area, room, brdf)
+    lit = lit + _strips_over_wall(patches, strips, strip_area, room, brdf)
     among = _exchange(patches, patches.centre, patches.normal) * patches.area
     np.fill_diagonal(among, 0.0)
+    among += _patches_over_wall(patches, room, brdf)
     back = room.albedo / math.pi
     glow = np.linalg.solve(np.eye(patches.area.size) - back * among, back * lit @ source)
     return _seen_over_wall(observer, patches, np.asarray(glow, dtype=np.float64), brdf)
@@ -172,14 +178,19 @@ def _exchange(patches: _Patches, points: Array, normals: Array) -> Array:
     return np.asarray(at_patch * at_point / square**2, dtype=np.float64)
 
 
-def _over_wall(patches: _Patches, strips: Array, strip_area: float, room: Room, brdf: AngleSumBRDF) -> Array:
-    """Irradiance at each patch per radiance of each strip over one reflection on the wall, (Q, M)."""
+def _wall_cells(room: Room) -> tuple[Array, Array, float]:
+    """Columns (X,) and rows (Z,) of the cells into which the room's wall is cut, and the area of one."""
     across, high = 160, 16
     x = ((np.arange(across) + 0.5) / across * 2 - 1) * room.half_width
     z = ((np.arange(high) + 0.5) / high * 2 - 1) * room.half_height
+    return x, z, 4 * room.half_width * room.half_height / (across * high)
+
+
+def _strips_over_wall(patches: _Patches, strips: Array, strip_area: float, room: Room, brdf: AngleSumBRDF) -> Array:
+    """Irradiance at each patch per radiance of each strip over one reflection on the wall, (Q, M)."""
+    x, z, cell = _wall_cells(room)
     gx, gz = (g.ravel() for g in np.meshgrid(x, z, indexing="ij"))
     wall = np.stack([gx, np.zeros(gx.size), gz], axis=1)
-    cell = 4 * room.half_width * room.half_height / gx.size
     to_patch = _exchange(patches, wall, np.array([0.0, -1.0, 0.0])) * cell
     theta_q = np.arctan2(patches.centre[:, None, 0] - gx, -patches.centre[:, None, 1])
     total = np.empty((patches.area.size, strips.shape[0]))
@@ -189,6 +200,22 @@ def _over_wall(patches: _Patches, strips: Array, strip_area: float, room: Room, 
         rho = brdf.of_sum(np.arctan2(x_s - gx, -y_s) + theta_q)
         total[:, i] = np.sum(to_patch * rho * irradiance, axis=1)
     return total
+
+
+def _patches_over_wall(patches: _Patches, room: Room, brdf: AngleSumBRDF) -> Array:
+    """Irradiance at each patch per radiance of each other patch over one reflection on the wall, (Q, Q)."""
+    columns, z, cell = _wall_cells(room)
+    # Patches above each other share their angle in the plane.
+    places, place_of = np.unique(patches.centre[:, :2], axis=0, return_inverse=True)
+    place_of = place_of.ravel()
+    total = np.zeros((patches.area.size, patches.area.size))
+    for x in columns:
+        wall = np.stack([np.full(z.size, x), np.zeros(z.size), z], axis=1)
+        exchange = _exchange(patches, wall, np.array([0.0, -1.0, 0.0]))
+        theta = np.arctan2(places[:, 0] - x, -places[:, 1])
+        rho = brdf.of_sum(theta[:, None] + theta[None, :])
+        total += (exchange @ exchange.T) * rho[place_of[:, None], place_of[None, :]]
+    return np.asarray(total * cell * patches.area, dtype=np.float64)
 
 
 def _seen_over_wall(observer: Observer, patches: _Patches, glow: Array, brdf: AngleSumBRDF) -> Array:

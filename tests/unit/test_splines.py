@@ -110,7 +110,18 @@ def test_the_peak_is_found_to_an_eighth_of_an_interval() -> None:
     grid = SplineGrid(start=-1.0, step=0.1, intervals=20, degree=3)
     r = np.exp(-0.5 * ((grid.start + grid.step * (np.arange(grid.size) - 1) - 0.234) / 0.2) ** 2)
     # Uniform cubic splines put coefficient k's bump at knot k - 1, and smooth a Gaussian without moving it.
-    assert grid.peak(r) == pytest.approx(0.234, abs=0.1 / 8)
+    everywhere = np.ones(grid.size)
+    assert grid.peak(r, everywhere) == pytest.approx(0.234, abs=0.1 / 8)
+
+
+def test_what_hardly_anybody_saw_is_no_peak() -> None:
+    grid = SplineGrid(start=-1.0, step=0.1, intervals=20, degree=3)
+    r = np.exp(-0.5 * ((grid.start + grid.step * (np.arange(grid.size) - 1)) / 0.2) ** 2)
+    r[-2] = 50.0  # what noise makes of a coefficient without data
+    exposure = np.ones(grid.size)
+    assert grid.peak(r, exposure) > 0.5
+    exposure[-2] = 1e-6
+    assert grid.peak(r, exposure) == pytest.approx(0.0, abs=0.1 / 8)
 
 
 # -- the transport over the basis -----------------------------------------------------------------------------

@@ -24,6 +24,8 @@ class Estimate:
         The closed form that it is or that it started from, with its certificates.
     coefficients, source, transport:
         r (K,), V (M, B), F (P, M) with F V = D / scale.
+    peak_at:
+        Angle sum in radians at which the well-seen part of the BRDF is largest: the gauge.
     source_std:
         Standard deviation of V, shape (M, B), in the gauge where the BRDF's peak is held fixed.
     brdf_std:
@@ -36,6 +38,7 @@ class Estimate:
     coefficients: Array
     source: Array
     transport: Array
+    peak_at: float
     source_std: Array
     brdf_std: Callable[[Array], Array]
     predicted_error: float

@@ -45,7 +45,7 @@ class Solution:
     method:
         "closed_form" or "maximum_likelihood".
     source, source_std:
-        V and its standard deviations, shape (M, B), in the gauge where the BRDF peaks at 1.
+        V and its standard deviations, shape (M, B), in the gauge where the well-seen part of the BRDF peaks at 1.
     angle_sum, brdf, brdf_std:
         rho on uniform nodes of u = theta_s + theta_o (radians), shape (L,); the standard deviation is inf where
         no capture saw that angle.
@@ -160,10 +160,9 @@ def conclude(
             f"the captures leave the pattern undetermined (its error bars come to {100 * estimate.predicted_error:.0f} "
             "% of it); capture more light, more views or more patterns"
         )
-    # Samples that include the peak; the largest of them is the gauge.
-    u = np.unique(np.append(np.linspace(grid.start, grid.stop, _CURVE_NODES), grid.peak(estimate.coefficients)))
+    u = np.unique(np.append(np.linspace(grid.start, grid.stop, _CURVE_NODES), estimate.peak_at))
     curve = grid.evaluate(estimate.coefficients, u)
-    peak = float(curve.max())
+    peak = float(grid.evaluate(estimate.coefficients, estimate.peak_at))
     views, pixels, _ = problem.captures.radiance.shape
     missed = np.linalg.norm(problem.data - estimate.transport @ estimate.source)
     warnings = list(estimate.warnings)

@@ -25,7 +25,7 @@ from wallmirror.derendering.one_bounce import check_one_bounce
 from wallmirror.derendering.problem import Problem, prepare
 from wallmirror.derendering.solution import Solution, conclude
 from wallmirror.derendering.splines import SplineGrid
-from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form
+from wallmirror.derendering.subspace import ClosedForm, SignalSpace, banded_gram, closed_form
 from wallmirror.errors import InputError, UndeterminedError
 
 Array = NDArray[np.float64]
@@ -131,6 +131,9 @@ def _closed_form(problem: Problem, space: SignalSpace, steps: tuple[float, ...])
     error = closed.error
     weights = problem.row_weights
     transport = np.stack([t @ closed.coefficients for t in designs], axis=1)
+    seen = banded_gram(designs)[0]
+    peak_at = grid.peak(closed.coefficients, seen / seen.max())
+    peak = float(grid.evaluate(closed.coefficients, peak_at))
     np.divide(closed.transport, weights, out=transport, where=weights > 0)
     return Estimate(
         method="closed_form",
@@ -139,8 +142,9 @@ def _closed_form(problem: Problem, space: SignalSpace, steps: tuple[float, ...])
         coefficients=closed.coefficients,
         source=closed.source,
         transport=transport,
+        peak_at=peak_at,
         source_std=np.full(closed.source.shape, error * float(np.sqrt(np.mean(closed.source**2)))),
-        brdf_std=lambda u: np.full(u.shape, error * float(np.max(grid.evaluate(closed.coefficients, u)))),
+        brdf_std=lambda u: np.full(u.shape, error * peak),
         predicted_error=error,
         chi_squared=math.nan,
         warnings=warnings,
@@ -193,7 +197,8 @@ def _maximum_likelihood(
         tell(f"knots every {step:g} deg: misfit {fit.objective:.6g} after {fit.iterations} steps")
         if best is not None:
             variance = 1.0 if problem.noise_is_stated else fit.objective / max(1, summed.observations - summed.size)
-            if best[3].objective - fit.objective < 2 * (summed.size - best[2].size) * variance:
+            added = int(np.count_nonzero(fit.coefficients)) - int(np.count_nonzero(best[3].coefficients))
+            if best[3].objective - fit.objective < 2 * max(added, 1) * variance:
                 # One idle halving ends the search, unless the noise is known and not yet reached.
                 idle += 1
                 reached = best[3].objective < best[2].observations + 4 * math.sqrt(2 * best[2].observations)
@@ -208,11 +213,13 @@ def _maximum_likelihood(
     stated = problem.noise_is_stated
     weights = problem.inverse_variance if problem.inverse_variance is not None else np.ones(1)
     counted = np.where(problem.noisy, weights * (problem.data - transport @ fit.source) ** 2, 0.0)
-    parameters = int(np.count_nonzero(summed.seen)) + fit.source.size
-    reduced = float(np.sum(counted)) / max(1, int(np.count_nonzero(problem.noisy)) - parameters)
+    parameters = int(np.count_nonzero(fit.coefficients)) + fit.source.size
+    freedom = max(1, int(np.count_nonzero(problem.noisy)) - parameters)
+    reduced = float(np.sum(counted)) / freedom
     # Where the noise is stated, a misfit beyond it widens the bars; where it is not, the misfit is the noise.
     sigma = math.sqrt(max(1.0, reduced) if stated else reduced)
-    bound = cramer_rao(summed, fit.coefficients, fit.source, gauge=grid.row(grid.peak(fit.coefficients)))
+    peak_at = grid.peak(fit.coefficients, summed.exposure)
+    bound = cramer_rao(summed, fit.coefficients, fit.source, gauge=grid.row(peak_at))
     warnings = []
     if not fit.converged:
         warnings.append("the fit stopped before it converged, so the error bars may be too small")
@@ -228,6 +235,7 @@ def _maximum_likelihood(
         coefficients=fit.coefficients,
         source=fit.source,
         transport=transport,
+        peak_at=peak_at,
         source_std=sigma * bound.source_std,
         brdf_std=lambda u: sigma * bound.brdf_std(grid, u),
         predicted_error=sigma * bound.source_error,

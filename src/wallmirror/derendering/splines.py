@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize_scalar
 
 from wallmirror.transport import Kernel
 
@@ -84,10 +85,28 @@ class SplineGrid:
         row[first[0] : first[0] + self.degree + 1] = values[:, 0]
         return row
 
-    def peak(self, coefficients: ArrayLike) -> float:
-        """Angle sum of the largest value among 8 samples a knot interval, in radians."""
+    def peak(self, coefficients: ArrayLike, exposure: ArrayLike) -> float:
+        """Angle sum in radians of the largest value where the data speak, searched from 8 samples a knot interval.
+
+        Parameters
+        ----------
+        coefficients:
+            r, shape (K,).
+        exposure:
+            How well each coefficient is seen, 1 for the best-seen, shape (K,); a value that hangs on a coefficient
+            seen a thousand times less may be anything and is no peak.
+        """
         u = np.linspace(self.start, self.stop, 8 * self.intervals + 1)
-        return float(u[np.argmax(self.evaluate(coefficients, u))])
+        first, values = self.basis(u)
+        blind = np.asarray(exposure) < 1e-3
+        trusted = ~np.any(blind[first + np.arange(self.degree + 1)[:, None]] & (values > 1e-3), axis=0)
+        candidates = np.where(trusted, self.evaluate(coefficients, u), -np.inf)
+        best = float(u[np.argmax(candidates)])
+        around = (max(self.start, best - self.step / 8), min(self.stop, best + self.step / 8))
+        refined = minimize_scalar(
+            lambda x: -float(self.evaluate(coefficients, x)), bounds=around, method="bounded", options={"xatol": 1e-9}
+        )
+        return float(refined.x)
 
     def evaluate(self, coefficients: ArrayLike, u: ArrayLike) -> Array:
         """rho(u), same shape as u, zero outside the grid."""

@@ -33,7 +33,7 @@ class Judgement:
     source_error:
         Relative error of the pattern, to compare with the solution's predicted_error.
     brdf_error:
-        Relative error of the BRDF over the angle sums that were seen; nan where the truth has no finite values.
+        Relative error of the BRDF over the angle sums known to 5 % of the peak; nan where the truth has no finite values.
     """
 
     source_error: float
@@ -112,8 +112,8 @@ def judge(solution: Solution, truth: Truth | None) -> Judgement | None:
 
 
 def well_seen(solution: Solution) -> NDArray[np.bool_]:
-    """Nodes of the BRDF that the captures determine to better than half its peak."""
-    return np.asarray(solution.brdf_std < 0.5)
+    """Nodes of the BRDF that the captures determine to better than 5 % of its peak."""
+    return np.asarray(solution.brdf_std < 0.05)
 
 
 def true_brdf(solution: Solution, truth: Truth | None) -> Array | None:
