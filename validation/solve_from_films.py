@@ -64,7 +64,17 @@ def main() -> int:
     for name in ("cornell_lobes", "reflective_card"):
         runs.extend(film_and_solve(name, depth, 0, arguments.spp, terminal) for depth in (2, 50))
     terminal.table(
-        ["scene", "depth", "seed", "pattern off by", "error bars say", "BRDF off by", "chi^2", "bias foretold", "verdict"],
+        [
+            "scene",
+            "depth",
+            "seed",
+            "pattern off by",
+            "error bars say",
+            "BRDF off by",
+            "chi^2",
+            "bias foretold",
+            "verdict",
+        ],
         [
             [
                 str(r["scene"]),
