@@ -65,7 +65,7 @@ def refused(call: Callable[[], object]) -> InputError:
     return caught.value
 
 
-def undetermined(call: Callable[[], object]) -> str:
+def assert_undetermined(call: Callable[[], object]) -> str:
     """The sentence of the UndeterminedError that a call raises, exit code 3."""
     with pytest.raises(UndeterminedError) as caught:
         call()

@@ -86,7 +86,7 @@ def with_first(more: str) -> str:
     return entry(0, 0, more=more) + "".join(entry(*pair) for pair in pairs()[1:])
 
 
-def refused(folder: Path, field: str, *parts: str) -> str:
+def assert_refused(folder: Path, field: str, *parts: str) -> str:
     with pytest.raises(InputError) as caught:
         read_captures(folder)
     error = caught.value
@@ -272,7 +272,7 @@ def test_folder_or_file_that_is_not_there(tmp_path: Path, folder: Path) -> None:
         read_captures(tmp_path / "absent")
     assert caught.value.exit_code == 2
     (folder / name(1, 0)).unlink()
-    refused(folder, "captures[3].file", name(1, 0), "no such file")
+    assert_refused(folder, "captures[3].file", name(1, 0), "no such file")
     (folder / "captures.toml").unlink()
     with pytest.raises(InputError, match=r"captures\.toml: no such file"):
         read_captures(folder)
@@ -321,12 +321,12 @@ def test_folder_or_file_that_is_not_there(tmp_path: Path, folder: Path) -> None:
 def test_faults_of_the_geometry(folder: Path, old: str, new: str, field: str, part: str) -> None:
     assert BY_HAND.count(old) >= 1
     rewrite(folder, BY_HAND.replace(old, new, 1))
-    refused(folder, field, part)
+    assert_refused(folder, field, part)
 
 
 def test_a_room_must_hold_card_and_observer(folder: Path) -> None:
     rewrite(folder, BY_HAND + "[room]\nhalf_width = 6.0\nhalf_height = 3.0\ndepth = 4.0\nalbedo = 0.8\n")
-    refused(folder, "room.depth", "deeper")
+    assert_refused(folder, "room.depth", "deeper")
 
 
 @pytest.mark.parametrize(
@@ -354,47 +354,47 @@ def test_faults_of_a_capture(folder: Path, more: str, field: str, part: str) -> 
     where = "captures[1]" if field == "variance_file" else "captures[5]"
     if field == "variance_file":  # the first capture without one is named
         rewrite(folder, entries=with_first(more))
-    refused(folder, f"{where}.{field}", part)
+    assert_refused(folder, f"{where}.{field}", part)
 
 
 @pytest.mark.parametrize("missing", ["file", "view", "realisation"])
 def test_a_field_missing_from_a_capture(folder: Path, missing: str) -> None:
     last = "\n".join(line for line in entry(1, 2).splitlines() if not line.startswith(missing))
     rewrite(folder, entries="".join(entry(*pair) for pair in pairs()[:-1]) + last)
-    refused(folder, f"captures[5].{missing}", "is missing")
+    assert_refused(folder, f"captures[5].{missing}", "is missing")
 
 
 @pytest.mark.parametrize("place", ["channel = 'Y'", "row = 0"])
 def test_a_default_given_twice(folder: Path, place: str) -> None:
     rewrite(folder, place + BY_HAND.replace("pixels = 6", "pixels = 6\n" + place))
-    refused(folder, place.split()[0], "given twice")
+    assert_refused(folder, place.split()[0], "given twice")
 
 
 def test_missing_and_doubled_pairs_are_named(folder: Path) -> None:
     rewrite(folder, entries="".join(entry(*pair) for pair in pairs() if pair != (1, 0)))
-    assert "view 1, realisation 0 is missing;" in refused(folder, "captures")
+    assert "view 1, realisation 0 is missing;" in assert_refused(folder, "captures")
     rewrite(folder, entries=entry(0, 0) + entry(1, 2))
-    assert "view 1, realisation 0 is missing (and 3 more)" in refused(folder, "captures")
+    assert "view 1, realisation 0 is missing (and 3 more)" in assert_refused(folder, "captures")
     rewrite(folder, entries=entry(0, 2_000_000_000))
-    assert "view 0, realisation 0 is missing" in refused(folder, "captures")  # at once, however many there are
+    assert "view 0, realisation 0 is missing" in assert_refused(folder, "captures")  # at once, however many there are
     rewrite(folder, entries="".join(entry(*pair) for pair in pairs()) + entry(1, 1, file="copy.exr"))
-    refused(folder, "captures[6].realisation", "view 1, realisation 1", "captured twice", "captures[4]")
+    assert_refused(folder, "captures[6].realisation", "view 1, realisation 1", "captured twice", "captures[4]")
     rewrite(folder, entries=entry(0, 0) + entry(2, 0))
-    refused(folder, "captures[1].view", "from 0 to 1")
+    assert_refused(folder, "captures[1].view", "from 0 to 1")
     rewrite(folder, entries="")
-    refused(folder, "captures", "missing")
+    assert_refused(folder, "captures", "missing")
     rewrite(folder, "captures = []\n" + BY_HAND, entries="")
-    refused(folder, "captures", "empty")
+    assert_refused(folder, "captures", "empty")
 
 
 def test_the_same_pixels_cannot_be_two_captures(folder: Path) -> None:
     rewrite(folder, entries="".join(entry(*pair) for pair in pairs()[:-1]) + entry(1, 2, file=name(1, 1)))
-    refused(folder, "captures[5].file", name(1, 1), "captures[4]")
+    assert_refused(folder, "captures[5].file", name(1, 1), "captures[4]")
 
 
 def test_another_width_names_both_sizes(folder: Path) -> None:
     plain(folder / name(1, 1), {"Y": np.ones((1, 7), np.float32)})
-    refused(folder, "captures[4].file", name(1, 1), "7 pixels wide", "observer.pixels is 6")
+    assert_refused(folder, "captures[4].file", name(1, 1), "7 pixels wide", "observer.pixels is 6")
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -402,7 +402,7 @@ def test_values_that_are_not_finite(folder: Path, value: float) -> None:
     spoiled = pixels(0, 1)
     spoiled[0, 3] = value
     plain(folder / name(0, 1), {"Y": spoiled})
-    refused(folder, "captures[1].file", name(0, 1), f"{value:g} at pixel 3")
+    assert_refused(folder, "captures[1].file", name(0, 1), f"{value:g} at pixel 3")
 
 
 @pytest.mark.parametrize("value", [math.nan, -1.0, -math.inf])
@@ -413,20 +413,20 @@ def test_variances_that_are_none(folder: Path, value: float) -> None:
     spoiled = np.ones((1, PIXELS), np.float32)
     spoiled[0, 2] = value
     plain(folder / "v10.exr", {"Y": spoiled})
-    refused(folder, "captures[3].variance_file", "v10.exr", f"{value:g} at pixel 2", "variances >= 0")
+    assert_refused(folder, "captures[3].variance_file", "v10.exr", f"{value:g} at pixel 2", "variances >= 0")
     plain(folder / "v10.exr", {"Y": np.ones((2, PIXELS), np.float32)})
-    refused(folder, "captures[3].variance_file", "v10.exr", "6 x 2", "6 x 1")
+    assert_refused(folder, "captures[3].variance_file", "v10.exr", "6 x 2", "6 x 1")
     (folder / "v10.exr").unlink()
-    refused(folder, "captures[3].variance_file", "v10.exr", "no such file")
+    assert_refused(folder, "captures[3].variance_file", "v10.exr", "no such file")
 
 
 def test_files_cut_short_or_no_exr_at_all(folder: Path) -> None:
     content = (folder / name(0, 1)).read_bytes()
     for length in range(0, len(content), 23):
         (folder / name(0, 1)).write_bytes(content[:length])
-        refused(folder, "captures[1].file", name(0, 1))
+        assert_refused(folder, "captures[1].file", name(0, 1))
     (folder / name(0, 1)).write_text("not an image")
-    refused(folder, "captures[1].file", "not an EXR file")
+    assert_refused(folder, "captures[1].file", "not an EXR file")
 
 
 def test_an_altered_pixel_is_refused_where_checksums_are(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -436,7 +436,7 @@ def test_an_altered_pixel_is_refused_where_checksums_are(folder: Path, monkeypat
     content = bytearray(path.read_bytes())
     content[-10] ^= 0x40
     path.write_bytes(content)
-    refused(folder, "captures[1].file", name(0, 1), "altered")
+    assert_refused(folder, "captures[1].file", name(0, 1), "altered")
     # Fault twin: with the check off the spoiled pixel goes through.
     monkeypatch.setattr(exr, "_verified_settings", lambda *_: None)
     assert not np.array_equal(read_captures(folder).radiance, expected)
@@ -452,13 +452,13 @@ def test_paths_that_leave_the_folder(folder: Path, tmp_path: Path) -> None:
     names = ["../outside.exr", "link.exr", "up/outside.exr", "loop.exr", "../set2/a.exr", "raw/../../outside.exr"]
     for file in [*names, str(outside), str(folder / name(0, 0)), "", "a\\u0000b.exr"]:
         rewrite(folder, entries=entry(0, 0, file=file) + "".join(entry(*pair) for pair in pairs()[1:]))
-        refused(folder, "captures[0].file", "folder")
+        assert_refused(folder, "captures[0].file", "folder")
         rewrite(folder, entries=with_first(f'variance_file = "{file}"'))
-        refused(folder, "captures[0].variance_file", "folder")
+        assert_refused(folder, "captures[0].variance_file", "folder")
     for file in ("raw", "."):
         (folder / "raw").mkdir(exist_ok=True)
         rewrite(folder, entries=entry(0, 0, file=file) + "".join(entry(*pair) for pair in pairs()[1:]))
-        refused(folder, "captures[0].file", "is not a file")
+        assert_refused(folder, "captures[0].file", "is not a file")
 
 
 @pytest.mark.parametrize("text", [b"format = ", b"\xff\xfe", b"a = " + b"1" * 5000, b"a = " + b"[" * 100_000])
@@ -473,7 +473,7 @@ def test_what_is_no_toml(folder: Path, text: bytes) -> None:
 def test_captures_that_are_no_list_of_tables(folder: Path, entries: str) -> None:
     inline = not entries.startswith("[")
     rewrite(folder, entries + BY_HAND if inline else BY_HAND, entries="" if inline else entries)
-    refused(folder, "captures", "[[captures]]")
+    assert_refused(folder, "captures", "[[captures]]")
 
 
 # -- there and back -------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card, Observer
 from wallmirror.transport import Weights, build_kernel, radiance, transport_matrix
 
-from .helpers import far_apart, lobes, refused, thesis_card, thesis_observer, undetermined, up_to_scale
+from .helpers import assert_undetermined, far_apart, lobes, refused, thesis_card, thesis_observer, up_to_scale
 
 Array = NDArray[np.float64]
 
@@ -235,7 +235,7 @@ METHODS: tuple[Method, ...] = ("auto", "closed_form", "maximum_likelihood")
 def test_a_wall_that_sends_the_same_everywhere_is_refused(method: Method) -> None:
     # Constant rho, G = 1: every pixel sees the plain sum of the pattern.
     captures = render(thesis_observer(100, 4), thesis_card(), Diffuse(albedo=0.5), patterns())
-    message = undetermined(lambda: solve(captures, method=method))
+    message = assert_undetermined(lambda: solve(captures, method=method))
     assert "only 1 independent pattern" in message
     assert "4 elements" in message
 
@@ -249,7 +249,7 @@ def test_the_same_wall_is_no_riddle_once_the_cosine_is_known() -> None:
 @pytest.mark.parametrize("method", METHODS)
 def test_fewer_realisations_than_elements_are_refused(method: Method) -> None:
     captures = render(thesis_observer(100, 4), thesis_card(), lobes(sigma_deg=3.0), patterns(4, 3))
-    message = undetermined(lambda: solve(captures, method=method))
+    message = assert_undetermined(lambda: solve(captures, method=method))
     assert "3 realisation(s)" in message
     assert "at least 4" in message
 
@@ -257,14 +257,14 @@ def test_fewer_realisations_than_elements_are_refused(method: Method) -> None:
 def test_alike_patterns_are_refused_with_their_number() -> None:
     source = np.repeat(patterns(4, 2), 10, axis=1)
     captures = render(thesis_observer(100, 4), thesis_card(), lobes(sigma_deg=3.0), source)
-    assert "only 2 independent pattern" in undetermined(lambda: solve(captures))
+    assert "only 2 independent pattern" in assert_undetermined(lambda: solve(captures))
 
 
 def test_an_element_that_never_glows_is_refused() -> None:
     source = patterns()
     source[2] = 0.0
     captures = render(thesis_observer(100, 4), thesis_card(), lobes(sigma_deg=3.0), source)
-    assert "only 3 independent pattern" in undetermined(lambda: solve(captures))
+    assert "only 3 independent pattern" in assert_undetermined(lambda: solve(captures))
 
 
 def test_one_dark_capture_among_others_is_recovered_as_dark() -> None:
@@ -279,19 +279,19 @@ def test_one_dark_capture_among_others_is_recovered_as_dark() -> None:
 @pytest.mark.parametrize("method", METHODS)
 def test_darkness_is_refused(method: Method) -> None:
     captures = render(thesis_observer(100, 4), thesis_card(), lobes(sigma_deg=3.0), 0 * patterns())
-    assert "dark" in undetermined(lambda: solve(captures, method=method))
+    assert "dark" in assert_undetermined(lambda: solve(captures, method=method))
 
 
 def test_elements_at_the_same_place_are_refused() -> None:
     card = Card(elements_x=(-1.0, 0.5, 0.5), y=-1.0)
     captures = render(thesis_observer(100, 4), card, lobes(sigma_deg=3.0), patterns(3))
-    assert "same place" in undetermined(lambda: solve(captures))
+    assert "same place" in assert_undetermined(lambda: solve(captures))
 
 
 def test_saturation_everywhere_is_refused() -> None:
     captures = render(thesis_observer(100, 4), thesis_card(), lobes(sigma_deg=3.0), patterns())
     blind = dataclasses.replace(captures, variance=np.full(captures.radiance.shape, math.inf))
-    assert "saturated" in undetermined(lambda: solve(blind))
+    assert "saturated" in assert_undetermined(lambda: solve(blind))
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
@@ -302,7 +302,7 @@ def test_elements_that_share_no_angle_are_refused(method: Method, noise: float) 
     observer, card = far_apart()
     captures = render(observer, card, lobes(), patterns(2))
     data = captures.radiance + noise * np.random.default_rng(4).standard_normal(captures.radiance.shape)
-    undetermined(lambda: solve(dataclasses.replace(captures, radiance=data), method=method))
+    assert_undetermined(lambda: solve(dataclasses.replace(captures, radiance=data), method=method))
 
 
 @pytest.mark.parametrize(("pixels", "views", "elements"), [(2, 2, 2), (10, 1, 4), (3, 1, 2)])
@@ -310,7 +310,7 @@ def test_fewer_pixels_than_unknowns_are_refused(pixels: int, views: int, element
     captures = render(
         thesis_observer(pixels, views), thesis_card(elements), lobes(sigma_deg=5.0), patterns(elements, elements)
     )
-    undetermined(lambda: solve(captures))
+    assert_undetermined(lambda: solve(captures))
 
 
 class Ripple(AngleSumBRDF):

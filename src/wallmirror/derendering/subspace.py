@@ -72,7 +72,6 @@ class ClosedForm:
     mismatch: float
     gap: float
     near_solutions: int
-    mixing_condition: float
 
     @property
     def error(self) -> float:
@@ -144,7 +143,6 @@ def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) ->
         mismatch=mismatch,
         gap=float(lost[1]) if lost.size > 1 else 1.0,
         near_solutions=max(1, near),
-        mixing_condition=float(np.linalg.cond(projected)),
     )
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from wallmirror.brdf import AngleSumBRDF
-from wallmirror.console import Advance
 from wallmirror.files import write_atomically
 from wallmirror.interreflection import directional_albedo
 from wallmirror.jobs.capturing import capture_scene
@@ -290,11 +289,3 @@ def _bounces_section(demo: Demo, pictures: dict[str, Any]) -> Section:
             ),
         ),
     )
-
-
-def silent_stage(_: str) -> Any:
-    """A stage that shows nothing, for calls from Python."""
-    from contextlib import nullcontext
-
-    advance: Advance = lambda done, total: None  # noqa: E731
-    return nullcontext(advance)

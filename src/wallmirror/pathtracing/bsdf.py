@@ -37,6 +37,7 @@ from __future__ import annotations
 import functools
 import importlib
 import math
+from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
@@ -99,7 +100,7 @@ def _plugins(mi: Any, dr: Any) -> dict[str, Any]:
         # Dr.Jit gathers from scalar arrays only by their own indexing.
         return dr.gather(dtype, source, UInt32(index)) if dr.is_jit_v(source) else source[int(index)]
 
-    class Row:
+    class Row(ABC):
         """rho as a function of theta alone, the other direction being given; angles and sums in double precision.
 
         A subclass sets `start` and `total`, the cumulative sum where theta begins and its gain up to where theta
@@ -111,21 +112,21 @@ def _plugins(mi: Any, dr: Any) -> dict[str, Any]:
         step: float
         last: int
 
+        @abstractmethod
         def locate(self, theta: Any) -> tuple[Any, Any]:
             """Cell and fraction of an angle."""
-            raise NotImplementedError
 
+        @abstractmethod
         def theta(self, index: Any, fraction: Any) -> Any:
             """Angle at a cell and fraction."""
-            raise NotImplementedError
 
+        @abstractmethod
         def ends(self, index: Any) -> tuple[Any, Any]:
             """rho at both ends of a cell, differentiable with respect to the table."""
-            raise NotImplementedError
 
+        @abstractmethod
         def cumulated(self, node: Any) -> Any:
             """Cumulative sum at a node."""
-            raise NotImplementedError
 
         def value(self, index: Any, fraction: Any) -> Any:
             """rho inside a cell."""
@@ -235,13 +236,13 @@ def _plugins(mi: Any, dr: Any) -> dict[str, Any]:
             self.table = mi.TensorXf(self.checked)
             self.derive(self.checked)
 
+        @abstractmethod
         def derive(self, table: NDArray[np.float32]) -> None:
             """Set nodes and cumulative sums from a checked table."""
-            raise NotImplementedError
 
+        @abstractmethod
         def row(self, ctx: Any, theta_i: Any) -> Any:
             """The row for one direction given."""
-            raise NotImplementedError
 
         def traverse(self, callback: Any) -> None:
             callback.put("table", self.table, mi.ParamFlags.Differentiable)
