@@ -138,6 +138,8 @@ def from_room(observer: Observer, card: Card, room: Room, brdf: AngleSumBRDF, so
     Strips light the patches directly and over the wall; patches light each other (radiosity), directly and over the
     wall, and then the wall. The card casts no shadow here.
     """
+    if room.albedo == 0:
+        return np.zeros((observer.views, observer.pixels, source.shape[1]))
     patches = _room_patches(room)
     strips = np.stack([np.asarray(card.elements_x), np.full(card.elements, card.y), np.zeros(card.elements)], axis=1)
     strip_area = 1.0 if card.is_points else card.element_width * card.element_height

@@ -105,6 +105,52 @@ def test_light_back_from_the_card_matches_a_random_walk():
     assert error < 0.02 * expected
 
 
+def test_light_over_a_room_matches_a_random_walk_that_meets_the_wall_again():
+    """Paths through a box with a diffuse wall; every meeting with the room is connected to the wall point looked at."""
+    room = Room(half_width=2.0, half_height=1.5, depth=4.0, albedo=0.8)
+    card, wall = white_card(albedo=0.0), Diffuse(albedo=0.8)
+    rng = np.random.default_rng(11)
+    count = 200_000
+    place = np.zeros((count, 3))
+    place[:, 0] = rng.choice(card.elements_x, count)
+    place[:, 1] = card.y
+    normal = np.tile([0.0, 1.0, 0.0], (count, 1))
+    flux = np.full(count, math.pi * card.element_width * card.element_height * 3 / count)
+    low, high = np.array([-2.0, -4.0, -1.5]), np.array([2.0, 0.0, 1.5])
+    sums = {"all": np.zeros(count), "wall met once at most": np.zeros(count)}
+    met = np.zeros(count, dtype=int)
+    alive = np.ones(count, dtype=bool)
+    for _ in range(12):
+        # Cosine-distributed about the normal: a unit normal plus a uniform unit vector.
+        ball = rng.standard_normal((count, 3))
+        way = normal + ball / np.linalg.norm(ball, axis=1, keepdims=True)
+        with np.errstate(divide="ignore"):
+            steps = np.where(way > 0, (high - place) / way, (low - place) / way)
+        steps[normal != 0] = np.where(steps[normal != 0] < 1e-9, np.inf, steps[normal != 0])
+        axis = np.argmin(steps, axis=1)
+        side = np.sign(way[np.arange(count), axis])
+        place = place + steps.min(axis=1, keepdims=True) * way
+        normal = np.zeros((count, 3))
+        normal[np.arange(count), axis] = -side
+        at_wall = (axis == 1) & (side > 0)
+        alive &= ~((axis == 1) & (side < 0))  # out through the open end
+        flux = flux * np.where(at_wall, wall.albedo, room.albedo)
+        square = np.sum(place**2, axis=1)
+        facing = np.maximum(np.sum(-place * normal, axis=1), 0.0)
+        seen = alive & ~at_wall
+        sample = np.where(seen, flux / math.pi * facing * -place[:, 1] / square**2 * wall.albedo / math.pi, 0.0)
+        sums["all"] += sample
+        sums["wall met once at most"] += np.where(met <= 1, sample, 0.0)
+        met += at_wall
+    expected, error = sums["all"].sum(), sums["all"].std() * math.sqrt(count)
+    looking = Observer(position=(0.0, -3.0), fov=1e-3, view_angles=(0.0,), pixels=2)
+    found = from_room(looking, card, room, wall, np.ones((3, 1)))[0, 0, 0]
+    # Ten per cent: patches exchange light from centre to centre, which is too much in the corners of so small a box.
+    assert error < 0.01 * expected
+    assert abs(found - expected) < 4 * error + 0.1 * expected
+    assert sums["wall met once at most"].sum() < 0.85 * expected  # the walk does tell
+
+
 def test_nothing_comes_back_from_a_black_card_and_a_black_room():
     source = np.ones((3, 2))
     assert not from_card(OBSERVER, white_card(albedo=0.0), SATIN, source).any()

@@ -111,8 +111,8 @@ class Bounces:
     ratios:
         q_k for k = 1, 2, ...; nan where T^k L_e is zero.
     tail_bound:
-        Bound on everything beyond the last term from the terms alone: geometric, with the upper limit of the ratios
-        that were measured beyond the first round. It rests on the ratios not growing any more; `rest` is the check.
+        Bound on everything beyond the last term from the terms alone: geometric, with the upper limit of the last
+        ratios plus their last growth. It rests on the ratios growing no more than that again; `rest` is the check.
     exact:
         Whether depth DEEP and one bounce give the same picture to the bit.
     """
@@ -217,8 +217,14 @@ def series_of(scene: str, light: Array, *, exact: bool) -> Bounces:
 
 
 def _largest_ratio(ratios: tuple[Measured, ...]) -> float:
-    """Upper limit of the ratios beyond the first round, which still depends on where the strips stand."""
-    return max((r.high for r in ratios[1:] if math.isfinite(r.high)), default=0.0)
+    """Bound on the ratios beyond the last: its upper limit, and once more what it grew by in the last round trip.
+
+    The first ratios still depend on where the strips stand; the later ones climb, ever more slowly, to the largest
+    eigenvalue of the round trip.
+    """
+    late = [r for r in ratios[-2:] if math.isfinite(r.value)]
+    growth = ratios[-1].value - ratios[-3].value
+    return max((r.high for r in late), default=0.0) + (max(0.0, growth) if math.isfinite(growth) else 0.0)
 
 
 def _ratio(above: Array, below: Array, rounding: float = 0.0) -> Measured:
