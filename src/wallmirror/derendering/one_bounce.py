@@ -2,8 +2,8 @@
 
 The residual of a one-bounce fit cannot tell: interreflection is nearly tangent to the one-bounce model, so that
 another pattern explains it. What can tell is the known geometry: the light that card and room send back is computed
-from the recovered BRDF (`interreflection`), added to the model's own data, and solved again; the change of the
-pattern is the bias.
+from the recovered BRDF (`interreflection`), taken from the films, and the rest is solved again; the change of the
+pattern is the bias. It is a forecast and no correction: the light taken away hangs on the wall's albedo.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from wallmirror.captures import CaptureSet
 from wallmirror.derendering.estimate import Estimate, scale_free_error
 from wallmirror.derendering.likelihood import maximise, moments
 from wallmirror.derendering.problem import Problem
+from wallmirror.derendering.splines import SplineGrid
 from wallmirror.interreflection import directional_albedo, from_card, from_room
 
 Array = NDArray[np.float64]
 
 # A bias needs no finer spline than this, in degrees.
 _FINEST_DEG = 0.25
+_ROUNDS = 3
 
 #: Wall albedo that is assumed where none is given: a painted wall.
 ASSUMED_ALBEDO = 0.5
@@ -95,27 +97,32 @@ def check_one_bounce(
     assumed = wall_albedo is None
     albedo = ASSUMED_ALBEDO if wall_albedo is None else wall_albedo
     grid = estimate.grid
-    u = np.linspace(grid.start, grid.stop, 8 * grid.intervals + 1)
-    extra = beyond_one_bounce(
-        problem.captures,
-        u,
-        grid.evaluate(estimate.coefficients, u),
-        estimate.source * problem.scale,
-        wall_albedo=albedo,
-    )
+    extra = _further_light(problem, grid, estimate.coefficients, estimate.source, albedo)
     if extra is None:
         return None
-    model = estimate.transport @ estimate.source
-    extra = extra.reshape(model.shape) / problem.scale
     coarse, designs = problem.designs(max(math.degrees(grid.step), _FINEST_DEG), degree=3, tolerance=1e-4)
     start = coarse.interpolate(lambda u: grid.evaluate(estimate.coefficients, u))
-    sources = []
-    for data in (model, model + extra):
-        summed = moments(data, designs, problem.inverse_variance)
-        sources.append(maximise(summed, start).source)
+    believed = maximise(moments(problem.data, designs, problem.inverse_variance), start)
+    # The first forecast comes from a BRDF that is biased itself, so it is made anew from the films freed of it.
+    for _ in range(_ROUNDS):
+        freed = maximise(moments(problem.data - extra, designs, problem.inverse_variance), start)
+        again = _further_light(problem, coarse, freed.coefficients, freed.source, albedo)
+        assert again is not None
+        extra = again
     return OneBounceCheck(
-        share=float(np.sum(extra) / np.sum(model)),
-        bias=scale_free_error(sources[1], sources[0]),
+        share=float(np.sum(extra) / max(float(np.sum(problem.data - extra)), 1e-300)),
+        bias=scale_free_error(believed.source, freed.source),
         wall_albedo=albedo,
         assumed=assumed,
     )
+
+
+def _further_light(
+    problem: Problem, grid: SplineGrid, coefficients: Array, source: Array, wall_albedo: float
+) -> Array | None:
+    """`beyond_one_bounce` of an estimate in the problem's normalised data, (P, B)."""
+    u = np.linspace(grid.start, grid.stop, 8 * grid.intervals + 1)
+    extra = beyond_one_bounce(
+        problem.captures, u, grid.evaluate(coefficients, u), source * problem.scale, wall_albedo=wall_albedo
+    )
+    return None if extra is None else extra.reshape(problem.data.shape) / problem.scale
