@@ -39,7 +39,7 @@ WALLS: dict[str, AngleSumBRDF] = {"lobes": GaussianTrain.of_the_code(), "diffuse
 #: The strip that is varied in one of its three lengths at a time, in metres: that of the shipped scenes.
 USUAL = {"width": 0.02, "height": 0.02, "distance": 1.0}
 PIXELS = 200
-#: Half-heights of the limits in MITSUBA.md, at distance 1, straight below the strip's middle.
+#: Half-heights of the limits that an early prototype measured, at distance 1, straight below the strip's middle.
 HALF_HEIGHTS = {0.5: 0.94, 10.0: 5.6e-4, 50.0: 6.6e-6}
 
 

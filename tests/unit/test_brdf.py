@@ -277,7 +277,7 @@ def test_tabulated_nodes_are_rounded_to_float32_and_no_more() -> None:
 
 
 def test_interpolation_error_of_a_render_is_of_the_measured_size() -> None:
-    # The prototype's renders of a sigma = 1 deg wall (MITSUBA.md) erred by 4.4e-3, 1.9e-4, 1.2e-5 with 361, 1801, 7201
+    # The prototype's renders of a sigma = 1 deg wall erred by 4.4e-3, 1.9e-4, 1.2e-5 with 361, 1801, 7201
     # nodes. Its scene is not recorded; ours (root mean square over the render's brightest pixel) is 1.4 times that with
     # all three, and falls as the step's square once the step is below sigma.
     scene = load_scene("flat_wall_lobes")

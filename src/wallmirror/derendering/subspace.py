@@ -99,7 +99,7 @@ def signal_space(data: Array, elements: int, *, noise_floor: float = 0.0) -> Sig
 
 
 def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) -> ClosedForm:
-    """Recover r, F and V from data whose rank is M (SOLVER: minimise sum_i |(I - U U^T) T_i r|^2).
+    """Recover r, F and V from data whose rank is M: minimise sum_i |(I - U U^T) T_i r|^2.
 
     Parameters
     ----------

@@ -278,9 +278,9 @@ def _bounces_section(demo: Demo, pictures: dict[str, Any]) -> Section:
         (
             "The model knows one bounce on the wall (Hypothesis 2 of the thesis). A white card or the walls of a room "
             "send light back, and another pattern explains that light almost as well: the misfit hardly shows it. So the "
-            "solver asks the known geometry instead: it computes the light that card and room would send back, solves "
-            "once more with it, and warns when the pattern would turn by more than half its error bars. The films cut off "
-            "after one bounce are controls that only a computer can make.",
+            "solver asks the known geometry instead: it computes the light that card and room would send back, takes it "
+            "from the films, solves once more, and warns when the pattern turns by more than half its error bars. The "
+            "films cut off after one bounce are controls that only a computer can make.",
             table,
             FigureBlock(error_bars(bars), "Measured error of the pattern beside what the solver's error bars claim."),
             *(
