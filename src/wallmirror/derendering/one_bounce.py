@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 # A bias needs no finer spline than this, in degrees.
 _FINEST_DEG = 0.25
 _ROUNDS = 3
+# A forecast that moves by less than this is good enough for one that is to hold within a factor of two.
+_SETTLED = 0.1
 
 #: Wall albedo that is assumed where none is given: a painted wall.
 ASSUMED_ALBEDO = 0.5
@@ -108,7 +110,10 @@ def check_one_bounce(
         freed = maximise(moments(problem.data - extra, designs, problem.inverse_variance), start)
         again = _further_light(problem, coarse, freed.coefficients, freed.source, albedo)
         assert again is not None
+        change = np.linalg.norm(again - extra) / np.linalg.norm(again)
         extra = again
+        if change < _SETTLED:
+            break
     return OneBounceCheck(
         share=float(np.sum(extra) / max(float(np.sum(problem.data - extra)), 1e-300)),
         bias=scale_free_error(believed.source, freed.source),

@@ -25,7 +25,7 @@ from wallmirror.derendering.one_bounce import check_one_bounce
 from wallmirror.derendering.problem import Problem, prepare
 from wallmirror.derendering.solution import Solution, conclude
 from wallmirror.derendering.splines import SplineGrid
-from wallmirror.derendering.subspace import ClosedForm, SignalSpace, banded_gram, closed_form
+from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form
 from wallmirror.errors import InputError, UndeterminedError
 
 Array = NDArray[np.float64]
@@ -131,8 +131,7 @@ def _closed_form(problem: Problem, space: SignalSpace, steps: tuple[float, ...])
     error = closed.error
     weights = problem.row_weights
     transport = np.stack([t @ closed.coefficients for t in designs], axis=1)
-    seen = banded_gram(designs)[0]
-    peak_at = grid.peak(closed.coefficients, seen / seen.max())
+    peak_at = grid.peak(closed.coefficients, closed.exposure)
     peak = float(grid.evaluate(closed.coefficients, peak_at))
     np.divide(closed.transport, weights, out=transport, where=weights > 0)
     return Estimate(

@@ -64,6 +64,8 @@ class ClosedForm:
         1 - lambda_2: how far the second-best BRDF is from explaining the data; 0 means undetermined.
     near_solutions:
         Number of orthogonal BRDFs that explain the data as well as the best within a factor of 100.
+    exposure:
+        How well each coefficient is seen, 1 for the best-seen, shape (K,).
     """
 
     coefficients: Array
@@ -72,6 +74,7 @@ class ClosedForm:
     mismatch: float
     gap: float
     near_solutions: int
+    exposure: Array
 
     @property
     def error(self) -> float:
@@ -118,7 +121,8 @@ def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) ->
     u = space.basis
     size = designs[0].shape[1]
     stacked = np.concatenate([(t.T @ u).T for t in designs])  # H, (M^2, K); rows i*M..i*M+M-1 belong to T_i
-    factor = _banded_cholesky(banded_gram(designs))
+    band = banded_gram(designs)
+    factor = _banded_cholesky(band)
     values, leading = _leading_pairs(stacked, factor, len(designs))
     r = sl.cho_solve_banded((factor, True), stacked.T @ leading)
     projected = (stacked @ r).reshape(len(designs), -1).T  # W, (M, M): column i is U^T T_i r
@@ -143,6 +147,7 @@ def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) ->
         mismatch=mismatch,
         gap=float(lost[1]) if lost.size > 1 else 1.0,
         near_solutions=max(1, near),
+        exposure=band[0] / max(float(band[0].max()), 1e-300),
     )
 
 
