@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from wallmirror.comparison import Comparison
@@ -132,6 +132,7 @@ def radiance_maps(reference: Array, mean: Array, comparison: Comparison, *, unit
     left_out.set_title("difference (grey: left out)", fontsize=10)
     figure.colorbar(z, ax=left_out, label="standard errors", pad=0.02)
     panels[0].set_ylabel("view")
+    panels[0].yaxis.set_major_locator(MaxNLocator(integer=True))
     for axes in panels:
         axes.set_xlabel("pixel")
         axes.tick_params(labelsize=9)
