@@ -480,3 +480,14 @@ def test_the_gauge_is_a_brdf_whose_largest_value_is_one() -> None:
     _, _, _, clean = scene()
     data = clean + 0.01 * np.random.default_rng(25).standard_normal(clean.shape)
     assert solve(captured(data, None), step_deg=4.0).brdf.max() == pytest.approx(1.0, rel=8 * EPS)
+
+
+def test_error_bars_after_the_best_scale_add_up_to_the_predicted_error() -> None:
+    _, _, _, clean = scene()
+    sigma = 0.01 * float(clean.max())
+    data = clean + sigma * np.random.default_rng(26).standard_normal(clean.shape)
+    solution = solve(captured(data, np.full(clean.shape, sigma**2)), step_deg=4.0)
+    together = np.linalg.norm(solution.shape_std) / np.linalg.norm(solution.source)
+    assert together == pytest.approx(solution.predicted_error, rel=1e-9)  # the same trace, summed in another order
+    # In the gauge of the BRDF's peak the scale's own error comes on top, along V.
+    assert np.linalg.norm(solution.source_std) > np.linalg.norm(solution.shape_std)

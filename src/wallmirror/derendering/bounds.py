@@ -33,6 +33,8 @@ class Bound:
         Which of the K coefficients those are, shape (K,).
     source_std:
         Standard deviation of V, shape (M, B).
+    shape_std:
+        Standard deviation of V after the best global scale, which nobody can know, shape (M, B).
     source_error:
         Expected relative error of V in the Frobenius norm after the best global scale.
     """
@@ -40,6 +42,7 @@ class Bound:
     coefficients: Array
     seen: NDArray[np.bool_]
     source_std: Array
+    shape_std: Array
     source_error: float
 
     def brdf_std(self, grid: SplineGrid, u: Array) -> Array:
@@ -100,8 +103,20 @@ def cramer_rao(data: Moments, coefficients: Array, source: Array, *, gauge: Arra
         coefficients=covariance,
         seen=seen,
         source_std=np.sqrt(np.maximum(variance, 0.0)).T,
+        shape_std=_shape_std(source, inverse, coupled, covariance, variance),
         source_error=error,
     )
+
+
+def _shape_std(source: Array, inverse: Array, coupled: Array, covariance: Array, variance: Array) -> Array:
+    """Standard deviation of V freed of its part along V: Var(dv - v (v dv) / |v|^2), shape (M, B)."""
+    v = source.T
+    norm = max(float(np.sum(v * v)), 1e-300)
+    pulled = np.einsum("bi,bik->k", v, coupled)
+    together = np.einsum("bij,bj->bi", inverse, v) + np.einsum("bik,k->bi", coupled, covariance @ pulled)
+    along = float(np.sum(v * together))
+    free = variance - 2 * v * together / norm + v * v * along / norm**2
+    return np.asarray(np.sqrt(np.maximum(free, 0.0)).T, dtype=np.float64)
 
 
 def _scale_free_error(source: Array, inverse: Array, coupled: Array, covariance: Array) -> float:

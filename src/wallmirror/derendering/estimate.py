@@ -28,6 +28,8 @@ class Estimate:
         Angle sum in radians at which the well-seen part of the BRDF is largest: the gauge.
     source_std:
         Standard deviation of V, shape (M, B), in the gauge where the BRDF's peak is held fixed.
+    shape_std:
+        Standard deviation of V after the best global scale, shape (M, B).
     brdf_std:
         Standard deviation of rho at given angle sums.
     """
@@ -40,6 +42,7 @@ class Estimate:
     transport: Array
     peak_at: float
     source_std: Array
+    shape_std: Array
     brdf_std: Callable[[Array], Array]
     predicted_error: float
     chi_squared: float

@@ -46,6 +46,8 @@ class Solution:
         "closed_form" or "maximum_likelihood".
     source, source_std:
         V and its standard deviations, shape (M, B), in the gauge where the well-seen part of the BRDF peaks at 1.
+    shape_std:
+        Standard deviation of V after the best global scale, which nobody can know, shape (M, B).
     angle_sum, brdf, brdf_std:
         rho on uniform nodes of u = theta_s + theta_o (radians), shape (L,); the standard deviation is inf where
         no capture saw that angle.
@@ -81,6 +83,7 @@ class Solution:
     method: str
     source: Array = field(repr=False)
     source_std: Array = field(repr=False)
+    shape_std: Array = field(repr=False)
     angle_sum: Array = field(repr=False)
     brdf: Array = field(repr=False)
     brdf_std: Array = field(repr=False)
@@ -126,6 +129,7 @@ class Solution:
             "gauge": "max rho = 1",
             "source": _finite(self.source.tolist()),
             "source_std": _finite(self.source_std.tolist()),
+            "shape_std": _finite(self.shape_std.tolist()),
         }
 
     def to_json(self) -> str:
@@ -187,6 +191,7 @@ def conclude(
         method=estimate.method,
         source=estimate.source * peak * problem.scale,
         source_std=estimate.source_std * peak * problem.scale,
+        shape_std=estimate.shape_std * peak * problem.scale,
         angle_sum=u,
         brdf=curve / peak,
         brdf_std=estimate.brdf_std(u) / peak,

@@ -134,6 +134,7 @@ def _closed_form(problem: Problem, space: SignalSpace, steps: tuple[float, ...])
     peak_at = grid.peak(closed.coefficients, closed.exposure)
     peak = float(grid.evaluate(closed.coefficients, peak_at))
     np.divide(closed.transport, weights, out=transport, where=weights > 0)
+    spread = np.full(closed.source.shape, error * float(np.sqrt(np.mean(closed.source**2))))
     return Estimate(
         method="closed_form",
         grid=grid,
@@ -142,7 +143,8 @@ def _closed_form(problem: Problem, space: SignalSpace, steps: tuple[float, ...])
         source=closed.source,
         transport=transport,
         peak_at=peak_at,
-        source_std=np.full(closed.source.shape, error * float(np.sqrt(np.mean(closed.source**2)))),
+        source_std=spread,
+        shape_std=spread,
         brdf_std=lambda u: np.full(u.shape, error * peak),
         predicted_error=error,
         chi_squared=math.nan,
@@ -236,6 +238,7 @@ def _maximum_likelihood(
         transport=transport,
         peak_at=peak_at,
         source_std=sigma * bound.source_std,
+        shape_std=sigma * bound.shape_std,
         brdf_std=lambda u: sigma * bound.brdf_std(grid, u),
         predicted_error=sigma * bound.source_error,
         chi_squared=reduced if stated else math.nan,

@@ -193,7 +193,7 @@ def solution_sections(solved: Solved) -> list[Section]:
                     else (
                         FigureBlock(
                             source_deviations(solution, source_truth),
-                            "The same, recovered minus true, with two-sigma bars: most bars should touch the line.",
+                            "Recovered minus true, after the best scale, with two-sigma bars: most should touch the line.",
                         ),
                     )
                 ),

@@ -175,7 +175,7 @@ def recovered_source(solution: Solution, truth: Array | None = None) -> Figure:
         if truth is not None:
             axes.bar(place, truth[:, b] / top, width=0.72, color="#d0d7de", label="true")
         axes.errorbar(
-            place, scale * solution.source[:, b] / top, yerr=2 * scale * solution.source_std[:, b] / top,
+            place, scale * solution.source[:, b] / top, yerr=2 * scale * solution.shape_std[:, b] / top,
             fmt="o", color=OURS, markersize=5, capsize=4, label="recovered (±2 σ)",
         )  # fmt: skip
         axes.set_title(f"pattern {b + 1}", fontsize=10)
@@ -193,7 +193,7 @@ def source_deviations(solution: Solution, truth: Array) -> Figure:
     scale = float(np.sum(solution.source * truth) / np.sum(solution.source**2))
     top = float(np.max(truth)) / 100
     deviation = (scale * solution.source - truth).T.ravel() / top
-    bars = 2 * scale * solution.source_std.T.ravel() / top
+    bars = 2 * scale * solution.shape_std.T.ravel() / top
     figure = _figure(10.5, 2.2)
     axes = figure.add_subplot()
     axes.axhline(0, color=INK, linewidth=0.8)
