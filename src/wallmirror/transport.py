@@ -21,6 +21,7 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import erf
 
 from wallmirror.brdf import BRDF, AngleSumBRDF, Mirror
 from wallmirror.errors import InputError
@@ -274,8 +275,6 @@ def quadrature_order(width: float, tolerance: float) -> int:
 
 def _lobe_average(width: float, offsets: Array) -> Array:
     """Exact average of exp(-u^2/2) over [offset - width/2, offset + width/2]."""
-    from scipy.special import erf
-
     ends = (offsets[:, None] + 0.5 * width * np.array([1.0, -1.0])) / math.sqrt(2)
     if width < 1e-3:  # the difference of two erf would cancel
         return np.exp(-0.5 * offsets**2) * (1 + (offsets**2 - 1) * width**2 / 24)

@@ -360,4 +360,5 @@ def test_the_summary_is_json_and_says_all_but_the_maps() -> None:
 def test_an_unseen_template_can_be_told_in_json() -> None:
     template = np.zeros((VIEWS, PIXELS))
     found = compare(picture() + noisy(np.random.default_rng(12)), picture(), templates={("none", "of 1"): template})
-    json.dumps(found.summary(), allow_nan=False)
+    told = json.loads(json.dumps(found.summary(), allow_nan=False))
+    assert told["biases"][1]["detectable_99"] is None

@@ -207,9 +207,10 @@ def _maximum_likelihood(
                     break
                 continue
         best, idle = (grid, closed, summed, fit), 0
+        best_designs = designs
     assert best is not None
     grid, closed, summed, fit = best
-    _, designs = problem.designs(math.degrees(grid.step), degree=_NOISY_DEGREE, tolerance=1e-5)
+    designs = best_designs
     transport = np.stack([t @ fit.coefficients for t in designs], axis=1)
     stated = problem.noise_is_stated
     weights = problem.inverse_variance if problem.inverse_variance is not None else np.ones(1)

@@ -274,6 +274,7 @@ def _plugins(mi: Any, dr: Any) -> dict[str, Any]:
             return self.eval_pdf(ctx, si, wo, active)[1]
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+            """Direction drawn by rho in its angle and by a disk across the plane, and its weight eval / pdf."""
             row = self.row(ctx, angle(si.wi))
             index, fraction, theta = row.draw(Float64(sample1))
             rho = row.value(index, fraction)
