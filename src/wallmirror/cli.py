@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from wallmirror.console import Terminal
-from wallmirror.errors import WallmirrorError
+from wallmirror.errors import InputError, WallmirrorError
 
 app = typer.Typer(
     name="wallmirror",
@@ -86,6 +86,15 @@ def validate(
         typer.Option(min=4, max=1024, help="Samples per pixel of each of the 32 seeds: 256, or 64 if quick."),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer views and samples: sees only larger faults.")] = False,
+    bounces: Annotated[
+        bool, typer.Option("--bounces", help="Measure each bounce instead: is one enough (Hypothesis 2)?")
+    ] = False,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            help="With --bounces: share of the light that one bounce may leave out, e.g. 0.01; else only told."
+        ),
+    ] = None,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -94,6 +103,23 @@ def validate(
     from wallmirror.scene import load_scene, scene_names
 
     terminal = Terminal(as_json=as_json)
+    if tolerance is not None and not (bounces and 0 < tolerance < 1):
+        raise InputError("give a share between 0 and 1, together with --bounces", field="--tolerance")
+    if bounces:
+        from wallmirror.jobs.counting_bounces import count_bounces
+
+        asked = [load_scene(name) for name in (scenes or scene_names())]
+        with terminal.progress("counting bounces") as advance:
+            counted = count_bounces(
+                asked, out, tolerance=tolerance, quick=quick, views=views, spp=spp, seed=seed, progress=advance
+            )
+        for one in counted:
+            terminal.say(("" if tolerance is None else "ok    " if one.passed else "FAIL  ") + one.text)
+        enough = all(r.passed for r in counted)
+        verdict_word = "" if tolerance is None else "PASSED; " if enough else "FAILED; "
+        terminal.say(f"{verdict_word}open {out / 'bounces.html'}")
+        terminal.document({"passed": enough, "scenes": [r.summary() for r in counted]})
+        raise typer.Exit(0 if enough else 1)
     views = views or (QUICK_VIEWS if quick else VIEWS)
     spp = spp or (QUICK_SPP if quick else SPP)
     loaded = [load_scene(name) for name in (scenes or scene_names())]

@@ -106,7 +106,7 @@ class Card:
     albedo:
         Lambertian reflectance of the strips and of the board that carries them, in [0, 1).
     board_width, board_height:
-        Extent of the board behind the strips in metres; 0 for a card without a board.
+        Extent of the board behind the strips in metres; 0 for a card without a board. It is centred on the strips.
     """
 
     elements_x: tuple[float, ...]
@@ -150,6 +150,11 @@ class Card:
     def distance(self) -> float:
         """Distance from the wall in metres."""
         return -self.y
+
+    @property
+    def middle(self) -> float:
+        """Where along the wall the card is centred, halfway between its outermost elements, in metres."""
+        return 0.5 * (min(self.elements_x) + max(self.elements_x))
 
     @property
     def is_points(self) -> bool:

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wallmirror.brdf import AngleSumBRDF
+from wallmirror.brdf import AngleSumBRDF, Mirror
 from wallmirror.geometry import Card, Observer, outgoing_angles, pixel_tangents, wall_points
 from wallmirror.scene import Room
 from wallmirror.transport import build_kernel, strip_factor
@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 _COLUMNS = (24, 2, 64)
 _ROWS = (8, 2, 24)
 _WALL_NODES = 1500
+_STRIP_NODES = 4
 
 
 def directional_albedo(brdf: AngleSumBRDF, incidence: float = 0.0) -> float:
@@ -59,20 +60,11 @@ def from_card(observer: Observer, card: Card, brdf: AngleSumBRDF, source: Array)
     source:
         V, shape (M, B).
     """
-    width = card.board_width or (max(card.elements_x) - min(card.elements_x) + card.element_width)
-    height = card.board_height or card.element_height
+    nodes = _card_nodes(card)
     shape = (observer.views, observer.pixels, source.shape[1])
-    if card.albedo == 0 or card.is_points or width <= 0 or height <= 0:
+    if card.albedo == 0 or nodes is None:
         return np.zeros(shape)
-    middle = 0.5 * (max(card.elements_x) + min(card.elements_x)) if not card.board_width else 0.0
-    across, high = _nodes(_COLUMNS, width / card.distance), _nodes(_ROWS, height / card.distance)
-    pitch = width / across
-    columns = middle + (np.arange(across) + 0.5) * pitch - width / 2
-    nodes, shares = np.polynomial.legendre.leggauss(high)
-    rows, shares = nodes * height / 2, shares / 2
-    x = np.repeat(columns, high)
-    h = np.tile(rows, across)
-    area = pitch * height * np.tile(shares, across)
+    x, h, area = nodes.x, nodes.h, nodes.area
     strips = np.asarray(card.elements_x)
     strip_area = card.element_width * card.element_height
     # Irradiance at node q per radiance of source s, both through one reflection on the wall.
@@ -80,20 +72,96 @@ def from_card(observer: Observer, card: Card, brdf: AngleSumBRDF, source: Array)
     from_strips = _through_wall(x, h, strips, np.zeros(strips.size), card.distance, brdf) * strip_area
     back = card.albedo / math.pi
     reflected = np.linalg.solve(np.eye(x.size) - back * among, back * from_strips @ source)
-    board = Card(elements_x=tuple(columns), y=card.y, element_width=pitch * (1 - 1e-9), element_height=height)
+    height = nodes.height
+    board = Card(
+        elements_x=tuple(nodes.columns), y=card.y, element_width=nodes.pitch * (1 - 1e-9), element_height=height
+    )
     # A glowing board blurs whatever is finer than its columns.
-    scale = max(brdf.angular_scale, math.atan(pitch / card.distance) / 4)
+    scale = max(brdf.angular_scale, math.atan(nodes.pitch / card.distance) / 4)
     kernel = build_kernel(observer, board, resolution=scale, tolerance=1e-2)
     a = card.distance / np.cos(kernel.theta_s)
     flat = kernel.weight * brdf.of_sum(kernel.angle_sum)
     flat /= strip_factor(card.distance, card.distance * np.tan(kernel.theta_s), -height / 2, height / 2)
-    glow = reflected.reshape(across, high, -1)
+    glow = reflected.reshape(nodes.columns.size, nodes.rows.size, -1)
     seen = np.zeros(shape)
-    for row in range(high):
+    for row, (at, share) in enumerate(zip(nodes.rows, nodes.shares, strict=True)):
         # The board's glow fades with height, and so does what it sends to the wall's middle: each row by itself.
-        factor = shares[row] * height * card.distance**2 / (a * a + rows[row] ** 2) ** 2
+        factor = share * height * card.distance**2 / (a * a + at**2) ** 2
         seen += np.sum(flat * factor, axis=-1) @ glow[:, row]
     return seen
+
+
+def glow_in_mirror(card: Card, mirror: Mirror, source: Array) -> Array:
+    """Radiance that each strip of a reflective card sends beyond its own, lit by the card's image in a mirror, (M, B).
+
+    The mirror shows the card to itself at twice its distance, z' = 2 z, so that with R its reflectance the Lambertian
+    card's glow is L = (albedo / pi) R int (V + L) z'^2 / r^4 dA.
+
+    Parameters
+    ----------
+    source:
+        V, shape (M, B).
+    """
+    nodes = _card_nodes(card)
+    if card.albedo == 0 or nodes is None:
+        return np.zeros(source.shape)
+    twice = 2 * card.distance
+
+    def lit(x_q: Array, h_q: Array, x_s: Array, h_s: Array, area: Array) -> Array:
+        r_squared = (x_q[:, None] - x_s) ** 2 + (h_q[:, None] - h_s) ** 2 + twice**2
+        factor: Array = card.albedo / math.pi * mirror.reflectance * twice**2 / r_squared**2 * area
+        return factor
+
+    strips = np.asarray(card.elements_x)
+    at, shares = np.polynomial.legendre.leggauss(_STRIP_NODES)
+    across, up = (g.ravel() for g in np.meshgrid(at, at, indexing="ij"))
+    strip_x = (strips[:, None] + across * card.element_width / 2).ravel()
+    strip_h = np.tile(up * card.element_height / 2, strips.size)
+    strip_area = np.tile(np.outer(shares, shares).ravel() / 4, strips.size) * card.element_width * card.element_height
+    emitted = np.repeat(source, at.size**2, axis=0)
+    x, h, area = nodes.x, nodes.h, nodes.area
+    board = np.linalg.solve(np.eye(x.size) - lit(x, h, x, h, area), lit(x, h, strip_x, strip_h, strip_area) @ emitted)
+    # The camera's row of pixels sees the strips at z = 0, over all of their width.
+    seen_x = (strips[:, None] + at * card.element_width / 2).ravel()
+    level = np.zeros(seen_x.size)
+    glow = lit(seen_x, level, strip_x, strip_h, strip_area) @ emitted + lit(seen_x, level, x, h, area) @ board
+    return np.asarray(np.tensordot(shares / 2, glow.reshape(strips.size, at.size, -1), axes=(0, 1)), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class _CardNodes:
+    """Quadrature over the card's face: midpoints in columns of one pitch, Gauss-Legendre in rows (heights, shares)."""
+
+    columns: Array
+    pitch: float
+    rows: Array
+    shares: Array
+    height: float
+
+    @property
+    def x(self) -> Array:
+        return np.repeat(self.columns, self.rows.size)
+
+    @property
+    def h(self) -> Array:
+        return np.tile(self.rows, self.columns.size)
+
+    @property
+    def area(self) -> Array:
+        return self.pitch * self.height * np.tile(self.shares, self.columns.size)
+
+
+def _card_nodes(card: Card) -> _CardNodes | None:
+    """Nodes on the board, or on the strips' outline where there is none; None for a card without extent."""
+    width = card.board_width or (max(card.elements_x) - min(card.elements_x) + card.element_width)
+    height = card.board_height or card.element_height
+    if card.is_points or width <= 0 or height <= 0:
+        return None
+    across, high = _nodes(_COLUMNS, width / card.distance), _nodes(_ROWS, height / card.distance)
+    pitch = width / across
+    nodes, shares = np.polynomial.legendre.leggauss(high)
+    columns: Array = card.middle + (np.arange(across, dtype=np.float64) + 0.5) * pitch - width / 2
+    return _CardNodes(columns, pitch, nodes * height / 2, shares / 2, height)
 
 
 def _nodes(rule: tuple[int, int, int], distances: float) -> int:

@@ -286,11 +286,14 @@ def _card(scene: Scene, radiances: Array) -> dict[str, Any]:
             "emitter": {"type": "area", "radiance": {"type": "uniform", "value": float(radiances[element])}},
         }
     if card.board_width > 0 and card.board_height > 0:
-        middle = (min(card.elements_x) + max(card.elements_x)) / 2
         behind = card.y - _BOARD_GAP * card.distance
         parts["board"] = {
             **_rectangle(
-                scene, (middle, behind, 0.0), normal=_Y, along=_X, size=(card.board_width / 2, card.board_height / 2)
+                scene,
+                (card.middle, behind, 0.0),
+                normal=_Y,
+                along=_X,
+                size=(card.board_width / 2, card.board_height / 2),
             ),
             "bsdf": _diffuse(card.albedo),
             # Dark, and never chosen for a connection: an emitter only so that the camera looks through it.

@@ -81,7 +81,8 @@ def scene_plan(observer: Observer, card: Card, *, half_width: float, room: Room 
             textcoords="offset points", fontsize=9, color=INK,
         )  # fmt: skip
     if card.board_width:
-        axes.plot([-card.board_width / 2, card.board_width / 2], [card.y] * 2, color=FAINT, linewidth=3)
+        half = card.board_width / 2
+        axes.plot([card.middle - half, card.middle + half], [card.y] * 2, color=FAINT, linewidth=3)
     axes.scatter(card.elements_x, [card.y] * card.elements, color=WARM, s=28, zorder=3)
     axes.scatter([x_o], [y_o], color=OURS, s=60, marker="^", zorder=3)
     label: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9, "color": INK}
@@ -103,15 +104,27 @@ def photograph(image: Array, *, caption: str = "") -> Figure:
     """A 2-D render with the tone curve of a display (sRGB); the brightest half per cent is clipped."""
     height, width = image.shape[:2]
     figure = _figure(7.2, 7.2 * height / width)
-    axes = figure.add_subplot()
-    top = float(np.quantile(image, 0.995)) or 1.0
-    tone = np.clip(image / top, 0, 1)
+    _show(figure.add_subplot(), image, float(np.quantile(image, 0.995)), caption)
+    return figure
+
+
+def one_tone(images: tuple[Array, ...], captions: tuple[str, ...]) -> Figure:
+    """Renders of one size side by side, in one tone scale set by the last, so that they can be compared by eye."""
+    height, width = images[0].shape[:2]
+    figure = _figure(10.5, 10.5 / len(images) * height / width + 0.3)
+    white = float(np.quantile(images[-1], 0.98))
+    for axes, image, caption in zip(figure.subplots(1, len(images)), images, captions, strict=True):
+        _show(axes, image, white, caption)
+    return figure
+
+
+def _show(axes: Axes, image: Array, white: float, caption: str) -> None:
+    tone = np.clip(image / (white or 1.0), 0, 1)
     tone = np.where(tone <= 0.0031308, 12.92 * tone, 1.055 * np.power(tone, 1 / 2.4) - 0.055)
     axes.imshow(tone, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     axes.set_axis_off()
     if caption:
         axes.set_title(caption, fontsize=10, color=INK)
-    return figure
 
 
 def radiance_maps(reference: Array, mean: Array, comparison: Comparison, *, unit: str = "") -> Figure:
