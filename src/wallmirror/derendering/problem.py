@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
-from wallmirror.derendering.subspace import SignalSpace, signal_space
+from wallmirror.derendering.subspace import SignalSpace, signal_space, space_within
 from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card
 from wallmirror.transport import build_kernel
@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 # Variances below this share of the largest are raised to it: a pixel that saw no noise by luck must not outweigh
 # all others, and no spline follows a lobe's tail to better than about a hundredth of the noise at its peak.
 _VARIANCE_FLOOR = 1e-4
+# Knot spacings in degrees of the BRDFs into whose span noisy captures are projected, the most faithful first.
+_PROJECTION_STEPS = (1.0, 2.0, 4.0)
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,14 @@ def _signal_space(problem: Problem) -> SignalSpace:
         tail = float(np.sqrt(np.mean(space.singular_values[elements:] ** 2)))
         floor = tail * (1 + math.sqrt(realisations / rows))
         rank = int(np.count_nonzero(space.singular_values[:elements] > floor))
-        space = SignalSpace(space.basis, space.singular_values, min(rank, space.rank))
+        space = replace(space, rank=min(rank, space.rank))
+    for step in _PROJECTION_STEPS:
+        # Where patterns drown in the films, the finest BRDF grid in whose span they stand out is taken.
+        if space.rank >= elements or floor == 0:
+            break
+        _, designs = problem.designs(step, degree=3, tolerance=1e-4)
+        noise = 1.0 if problem.noise_is_stated else None
+        space = space_within(problem.weighted_data, problem.weighted(designs), elements, noise=noise)
     if space.rank < elements:
         raise UndeterminedError(
             f"the captures span only {space.rank} independent pattern(s) above the noise, but the card has "

@@ -212,20 +212,20 @@ def conclude(
 
 
 def _expected_mismatch(problem: Problem, space: SignalSpace, closed: ClosedForm) -> float:
-    """1 - lambda_1 that noise alone makes: s^2 (P - M) |V^+|^2 / |F|^2, from first-order perturbation of U.
+    """1 - lambda_1 that noise alone makes in P dimensions: s^2 (P - M) |V^+|^2 / |F|^2, from first-order perturbation of U.
 
     s^2 is 1 where the rows are whitened by stated variances, else the mean square of the singular values beyond M.
     """
-    rows, realisations = problem.data.shape
+    dimensions, realisations = space.dimensions, problem.data.shape[1]
     elements = problem.card.elements
     if problem.noise_is_stated:
         noise = 1.0
     elif realisations > elements:
-        noise = float(np.sum(space.singular_values[elements:] ** 2)) / (rows * (realisations - elements))
+        noise = float(np.sum(space.singular_values[elements:] ** 2)) / (dimensions * (realisations - elements))
     else:
         return math.nan
     inverse = np.linalg.pinv(closed.source)
-    return float(noise * (rows - elements) * np.sum(inverse**2) / np.sum(closed.transport**2))
+    return float(noise * (dimensions - elements) * np.sum(inverse**2) / np.sum(closed.transport**2))
 
 
 def _status(problem: Problem, estimate: Estimate, warnings: list[str]) -> str:

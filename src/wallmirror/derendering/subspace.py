@@ -38,11 +38,14 @@ class SignalSpace:
         All singular values of the data, descending, shape (min(P, B),).
     rank:
         How many of them stand out of rounding and noise, at most M.
+    dimensions:
+        Of the space that the noise fills: P, or less where the data were projected first.
     """
 
     basis: Array
     singular_values: Array
     rank: int
+    dimensions: int
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,38 @@ def signal_space(data: Array, elements: int, *, noise_floor: float = 0.0) -> Sig
     left, values, _ = np.linalg.svd(triangle)
     rounding = values[0] * np.finfo(np.float64).eps * max(data.shape) if values.size else 0.0
     rank = int(np.count_nonzero(values[:elements] > max(rounding, noise_floor)))
-    return SignalSpace(q @ left[:, :elements], values, rank)
+    return SignalSpace(q @ left[:, :elements], values, rank, data.shape[0])
+
+
+def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noise: float | None) -> SignalSpace:
+    """U from the data's projection onto what any BRDF on the designs' grid could make of any pattern.
+
+    All of F V lies in the span of T_1 .. T_M, whose dimension is at most M K; noise fills all P dimensions. The
+    projection leaves the signal and takes all but M K / P of the noise's power away, so that patterns stand out which
+    drown in the films as they are.
+
+    Parameters
+    ----------
+    data, designs:
+        D (P, B) and T_1 .. T_M (P, K), rows weighted so that the noise of all is alike.
+    noise:
+        Its standard deviation; None to estimate it from what the projection takes away.
+    """
+    span = sp.csc_array(sp.hstack(designs))
+    gram = (span.T @ span).toarray()
+    values, vectors = np.linalg.eigh(gram)
+    kept = values > 1e-10 * values[-1]
+    whitened = vectors[:, kept] / np.sqrt(values[kept])
+    projected = whitened.T @ (span.T @ data)  # coordinates in an orthonormal basis of the span
+    dimensions = int(np.count_nonzero(kept))
+    left, singular, _ = np.linalg.svd(projected, full_matrices=False)
+    if noise is None:
+        rest = max(0.0, float(np.sum(data * data) - np.sum(projected * projected)))
+        noise = math.sqrt(rest / max(1, (data.shape[0] - dimensions) * data.shape[1]))
+    floor = noise * (math.sqrt(dimensions) + math.sqrt(data.shape[1]))
+    rounding = singular[0] * np.finfo(np.float64).eps * max(data.shape)
+    rank = int(np.count_nonzero(singular[:elements] > max(rounding, floor)))
+    return SignalSpace(span @ (whitened @ left[:, :elements]), singular, rank, dimensions)
 
 
 def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) -> ClosedForm:
