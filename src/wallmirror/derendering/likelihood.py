@@ -130,19 +130,28 @@ def moments(data: Array, designs: list[sp.csr_array], inverse_variance: Array | 
     realisations = data.shape[1]
     if inverse_variance is None:
         inverse_variance = np.ones((data.shape[0], 1))
-    weights, group = np.unique(inverse_variance, axis=1, return_inverse=True)
-    group = np.broadcast_to(np.asarray(group).ravel(), (realisations,))
-    full = weights[:, group]
+    weights, group = _alike(inverse_variance)
+    group = np.broadcast_to(group, (realisations,))
+    full = np.broadcast_to(weights, data.shape) if weights.shape[1] == 1 else weights[:, group]
     weighted = full * data
     cross = np.stack([(t.T @ weighted).T for t in designs], axis=1)
     grams = [_grams(designs, weights[:, g]) for g in range(weights.shape[1])]
     return Moments(
         grams=grams,
-        group=group.astype(np.intp),
+        group=group,
         cross=cross,
         energy=np.sum(weighted * data, axis=0),
         observations=int(np.count_nonzero(full > 0)),
     )
+
+
+def _alike(inverse_variance: Array) -> tuple[Array, NDArray[np.intp]]:
+    """The different columns of the weights, and which of them each realisation has."""
+    first = inverse_variance[:, :1]
+    if np.array_equal(np.broadcast_to(first, inverse_variance.shape), inverse_variance):
+        return first, np.zeros(1, dtype=np.intp)
+    weights, group = np.unique(inverse_variance, axis=1, return_inverse=True)
+    return weights, np.asarray(group).ravel().astype(np.intp)
 
 
 def _grams(designs: list[sp.csr_array], weight: Array) -> dict[tuple[int, int], sp.csr_array]:
@@ -268,8 +277,7 @@ def _evaluate(data: Moments, r: Array, v: Array | None, *, nonnegative: bool) ->
 
 def _step(data: Moments, state: _State, seen: NDArray[np.bool_], *, nonnegative: bool) -> tuple[Array, float]:
     """The Gauss-Newton step in r with V eliminated, and the decrease of the objective that it promises."""
-    by_group = state.pair[data.group]  # (B, M, M, K)
-    residual = data.cross - np.einsum("bijk,bj->bik", by_group, state.v)  # T_i^T W e_b
+    residual = data.cross - _modelled(data, state)  # T_i^T W e_b
     grad_r = np.einsum("bi,bik->k", state.v, residual)
     grad_v = residual @ state.r
     free_v = np.ones_like(state.v, dtype=bool)
@@ -290,6 +298,18 @@ def _step(data: Moments, state: _State, seen: NDArray[np.bool_], *, nonnegative:
     dr = np.zeros_like(state.r)
     dr[cells] = step
     return dr, float(grad_r @ dr)
+
+
+def _modelled(data: Moments, state: _State) -> Array:
+    """T_i^T W F v_b, shape (B, M, K)."""
+    b, m = state.v.shape
+    total = np.empty((b, m, data.size))
+    for g, pair in enumerate(state.pair):
+        rows = np.flatnonzero(data.group == g)
+        # sum_j v_j (T_i^T W T_j r): one product of matrices a group.
+        product = state.v[rows] @ pair.transpose(1, 0, 2).reshape(m, -1)
+        total[rows] = product.reshape(rows.size, m, data.size)
+    return total
 
 
 def _step_above(floor: Array, quadratic: Array, linear: Array) -> Array:
@@ -343,10 +363,18 @@ def _schur(
     normal = np.where(both, normal, np.eye(m) * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-300)
     ridge = 1e-14 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(m)
     inverse = np.where(both, np.linalg.inv(normal + ridge), 0.0)
-    # C_b[i] = sum_j v_j (T_j^T W T_i r)
-    coupling = np.einsum("bj,bjik->bik", state.v, state.pair[data.group][..., cells])
+    coupling = _coupling(data, state)[..., cells]
     coupled = inverse @ coupling
-    schur = total[np.ix_(cells, cells)]
-    for b in range(coupling.shape[0]):
-        schur -= coupling[b].T @ coupled[b]
+    schur = total if cells.size == data.size else total[np.ix_(cells, cells)]
+    schur -= coupling.reshape(-1, cells.size).T @ coupled.reshape(-1, cells.size)
     return 0.5 * (schur + schur.T), inverse, coupled
+
+
+def _coupling(data: Moments, state: _State) -> Array:
+    """C_b[i] = sum_j v_j (T_j^T W T_i r), shape (B, M, K)."""
+    b, m = state.v.shape
+    total = np.empty((b, m, data.size))
+    for g, pair in enumerate(state.pair):
+        rows = np.flatnonzero(data.group == g)
+        total[rows] = (state.v[rows] @ pair.reshape(m, -1)).reshape(rows.size, m, data.size)
+    return total

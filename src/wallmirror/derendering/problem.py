@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 _VARIANCE_FLOOR = 1e-4
 # Knot spacings in degrees of the BRDFs into whose span noisy captures are projected, the most faithful first.
 _PROJECTION_STEPS = (1.0, 2.0, 4.0)
+# Noise below this share of the films is none that a projection could be sure of taking away.
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,7 @@ def _signal_space(problem: Problem) -> SignalSpace:
         space = replace(space, rank=min(rank, space.rank))
     for step in _PROJECTION_STEPS:
         # Where patterns drown in the films, the finest BRDF grid in whose span they stand out is taken.
-        if space.rank >= elements or floor == 0:
+        if space.rank >= elements or floor < _ROUNDING * space.singular_values[0]:
             break
         _, designs = problem.designs(step, degree=3, tolerance=1e-4)
         noise = 1.0 if problem.noise_is_stated else None

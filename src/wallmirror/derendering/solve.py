@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
@@ -39,6 +39,8 @@ _EXACT_DEGREE = 7
 _NOISY_DEGREE = 3
 # Below this mismatch the data count as free of noise: float64 renders end near 1e-24, float32 files near 1e-13.
 _NOISELESS = 1e-15
+# A misfit in units of the noise up to which finer knots are tried out before they are taken.
+_NEARLY_THERE = 3.0
 # At this mismatch rounding is all that is left: finer knots could only add to it.
 _EXACT = 3e-23
 
@@ -172,6 +174,74 @@ def _fit(summed: Moments, starts: list[Array], nonnegative: bool) -> Fit:
     return min(bounded, key=lambda fit: fit.objective)
 
 
+@dataclass(frozen=True)
+class _Level:
+    """A knot spacing with the best fit on it."""
+
+    grid: SplineGrid
+    designs: list[sp.csr_array]
+    summed: Moments
+    closed: ClosedForm
+    fit: Fit
+
+    def rho(self, u: Array) -> Array:
+        return self.grid.evaluate(self.fit.coefficients, u)
+
+    @property
+    def parameters(self) -> int:
+        return int(np.count_nonzero(self.fit.coefficients))
+
+
+def _pays(problem: Problem, best: _Level, fit: Fit, summed: Moments) -> bool:
+    """Whether finer knots explain more than as many coefficients would of noise (Akaike 1974)."""
+    variance = 1.0 if problem.noise_is_stated else fit.objective / max(1, summed.observations - summed.size)
+    added = int(np.count_nonzero(fit.coefficients)) - best.parameters
+    return best.fit.objective - fit.objective >= 2 * max(added, 1) * variance
+
+
+def _refine(
+    problem: Problem,
+    space: SignalSpace,
+    steps: tuple[float, ...],
+    nonnegative: bool,
+    tell: Callable[[str], None],
+) -> _Level:
+    """Halve the knot spacing while that pays."""
+    best: _Level | None = None
+    idle = 0
+    for step in steps:
+        grid, designs = problem.designs(step, degree=_NOISY_DEGREE, tolerance=1e-5)
+        summed = moments(problem.data, designs, problem.inverse_variance)
+        try:
+            fit = closed = None
+            start = None if best is None else grid.interpolate(best.rho)
+            if best is not None and start is not None and best.fit.objective < _NEARLY_THERE * summed.observations:
+                # Two steps from the coarser fit tell whether the finer knots can pay at all, before anything dearer.
+                fit = maximise(summed, start, nonnegative=nonnegative, max_iterations=2)
+            if best is None or fit is None or _pays(problem, best, fit, summed):
+                closed = closed_form(problem.weighted_data, problem.weighted(designs), space)
+                starts = [closed.coefficients] if start is None else [closed.coefficients, start]
+                fit = _fit(summed, starts, nonnegative)
+        except UndeterminedError:
+            if best is None:
+                raise
+            break  # so fine a grid has cells that nothing determines
+        assert fit is not None
+        tell(f"knots every {step:g} deg: misfit {fit.objective:.6g}")
+        if closed is None or (best is not None and not _pays(problem, best, fit, summed)):
+            assert best is not None
+            # One idle halving ends the search, unless the noise is known and not yet reached.
+            idle += 1
+            observations = best.summed.observations
+            reached = best.fit.objective < observations + 4 * math.sqrt(2 * observations)
+            if idle == 2 or (reached if problem.noise_is_stated else step < steps[1]):
+                break
+            continue
+        best, idle = _Level(grid, designs, summed, closed, fit), 0
+    assert best is not None
+    return best
+
+
 def _maximum_likelihood(
     problem: Problem,
     space: SignalSpace,
@@ -179,44 +249,14 @@ def _maximum_likelihood(
     nonnegative: bool,
     tell: Callable[[str], None],
 ) -> Estimate:
-    """Halve the knot spacing while that explains more than as many coefficients would of noise (Akaike 1974)."""
-    best: tuple[SplineGrid, ClosedForm, Moments, Fit] | None = None
-    idle = 0
-    for step in steps:
-        grid, designs = problem.designs(step, degree=_NOISY_DEGREE, tolerance=1e-5)
-        closed = closed_form(problem.weighted_data, problem.weighted(designs), space)
-        summed = moments(problem.data, designs, problem.inverse_variance)
-        starts = [closed.coefficients]
-        if best is not None:
-            starts.append(grid.interpolate(partial(best[0].evaluate, best[3].coefficients)))
-        try:
-            fit = _fit(summed, starts, nonnegative)
-        except UndeterminedError:
-            if best is None:
-                raise
-            break  # so fine a grid has cells that nothing determines
-        tell(f"knots every {step:g} deg: misfit {fit.objective:.6g} after {fit.iterations} steps")
-        if best is not None:
-            variance = 1.0 if problem.noise_is_stated else fit.objective / max(1, summed.observations - summed.size)
-            added = int(np.count_nonzero(fit.coefficients)) - int(np.count_nonzero(best[3].coefficients))
-            if best[3].objective - fit.objective < 2 * max(added, 1) * variance:
-                # One idle halving ends the search, unless the noise is known and not yet reached.
-                idle += 1
-                reached = best[3].objective < best[2].observations + 4 * math.sqrt(2 * best[2].observations)
-                if idle == 2 or (reached if problem.noise_is_stated else step < steps[1]):
-                    break
-                continue
-        best, idle = (grid, closed, summed, fit), 0
-        best_designs = designs
-    assert best is not None
-    grid, closed, summed, fit = best
-    designs = best_designs
-    transport = np.stack([t @ fit.coefficients for t in designs], axis=1)
+    """The best fit over the knot spacings, with error bars from its bound and doubts from its misfit."""
+    level = _refine(problem, space, steps, nonnegative, tell)
+    grid, summed, fit = level.grid, level.summed, level.fit
+    transport = np.stack([t @ fit.coefficients for t in level.designs], axis=1)
     stated = problem.noise_is_stated
     weights = problem.inverse_variance if problem.inverse_variance is not None else np.ones(1)
     counted = np.where(problem.noisy, weights * (problem.data - transport @ fit.source) ** 2, 0.0)
-    parameters = int(np.count_nonzero(fit.coefficients)) + fit.source.size
-    freedom = max(1, int(np.count_nonzero(problem.noisy)) - parameters)
+    freedom = max(1, int(np.count_nonzero(problem.noisy)) - level.parameters - fit.source.size)
     reduced = float(np.sum(counted)) / freedom
     # Where the noise is stated, a misfit beyond it widens the bars; where it is not, the misfit is the noise.
     sigma = math.sqrt(max(1.0, reduced) if stated else reduced)
@@ -233,7 +273,7 @@ def _maximum_likelihood(
     return Estimate(
         method="maximum_likelihood",
         grid=grid,
-        closed=closed,
+        closed=level.closed,
         coefficients=fit.coefficients,
         source=fit.source,
         transport=transport,

@@ -130,7 +130,8 @@ def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noi
         rest = max(0.0, float(np.sum(data * data) - np.sum(projected * projected)))
         noise = math.sqrt(rest / max(1, (data.shape[0] - dimensions) * data.shape[1]))
     floor = noise * (math.sqrt(dimensions) + math.sqrt(data.shape[1]))
-    rounding = singular[0] * np.finfo(np.float64).eps * max(data.shape)
+    # The span's weakest directions are known to the root of what was kept of them, no better.
+    rounding = 1e-7 * singular[0]
     rank = int(np.count_nonzero(singular[:elements] > max(rounding, floor)))
     return SignalSpace(span @ (whitened @ left[:, :elements]), singular, rank, dimensions)
 
