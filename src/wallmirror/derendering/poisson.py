@@ -1,0 +1,377 @@
+"""Maximum likelihood for photon counts: Fisher scoring, and the Cramer-Rao bound of counting.
+
+Counts D_pb are Poisson with mean m = F(r) V + background, so that up to a constant the log-likelihood is
+sum D log m - m. Its expected curvature is that of weighted least squares with w = 1/m, the inverse variance of a count
+(McCullagh and Nelder, Generalized Linear Models, 1989, section 2.5). With s = D/m - 1 a step of scoring solves
+
+    S dr = sum_b J_b^T s_b - C_b^T H_b^-1 F^T s_b,          dv_b = H_b^-1 (F^T s_b - C_b dr),
+
+where J_b = sum_i V_ib T_i, H_b = F^T W_b F, C_b = F^T W_b J_b and S = sum_b J_b^T W_b J_b - C_b^T H_b^-1 C_b. The weights
+differ from entry to entry and from step to step, but the largest sum needs none of the B products of its own:
+
+    sum_b J_b^T W_b J_b = sum_ij T_i^T diag(q_ij) T_j,          q_ij[p] = sum_b w_pb V_ib V_jb.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as sl
+import scipy.sparse as sp
+from numpy.typing import ArrayLike, NDArray
+
+from wallmirror.derendering.bounds import Bound, _scale_free_error, _shape_std
+from wallmirror.derendering.likelihood import _solve_positive, _step_above
+from wallmirror.errors import InputError
+
+Array = NDArray[np.float64]
+
+_RIDGE = 1e-12
+# Cells whose Fisher information lies this far below the best-seen cell's are left out.
+_SEEN = 1e-10
+# Where the mean is this far below the largest the bound counts no more information than there.
+_DARK = 1e-6
+# A start must give every count a chance: r and V are raised to this share of their largest entry.
+_START_FLOOR = 1e-6
+# Products of T's entries that are worth keeping: 200 MB of them.
+_MOST_PRODUCTS = 12_000_000
+
+
+@dataclass(frozen=True)
+class PoissonFit:
+    """A maximum of the Poisson likelihood.
+
+    Parameters
+    ----------
+    coefficients:
+        r, shape (K,).
+    source:
+        V in counts, shape (M, B).
+    gain:
+        Log-likelihood above that of the start, in nats.
+    chi_squared:
+        Pearson's sum (D - m)^2 / m per degree of freedom: 1 where the model and the counting are right.
+    iterations:
+        Scoring steps taken.
+    converged:
+        Whether the last step promised less than the tolerance.
+    """
+
+    coefficients: Array
+    source: Array
+    gain: float
+    chi_squared: float
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True)
+class _Counts:
+    counts: Array  # (P, B)
+    background: Array  # (P, B)
+    used: NDArray[np.bool_]  # (P, B)
+    designs: list[sp.csr_array]
+
+    def mean(self, r: Array, v: Array) -> Array:
+        return _transport(self.designs, r) @ v + self.background
+
+    def score(self, mean: Array, least: float) -> Array:
+        """Slope of the log-likelihood in the mean."""
+        return np.where(self.used, (self.counts - mean) / np.maximum(mean, least), 0.0)
+
+    def weights(self, mean: Array, least: float) -> Array:
+        """Its expected curvature."""
+        return np.where(self.used, 1 / np.maximum(mean, least), 0.0)
+
+    def gained(self, before: Array, after: Array, least: float) -> float:
+        """Difference of two log-likelihoods, summed entry by entry so that near the maximum it is not all rounding."""
+        low, high = np.maximum(before, least), np.maximum(after, least)
+        poisson = self.counts * np.log(high / low) - (high - low)
+        # Below the least mean: -((D - m)^2 - (D - least)^2) / (2 least), which is zero where m is above it.
+        normal = (
+            (2 * self.counts - after - high) * (after - high) - (2 * self.counts - before - low) * (before - low)
+        ) / 2
+        return float(np.sum(poisson + normal / least, where=self.used))
+
+
+def maximise_poisson(
+    counts: Array,
+    designs: list[sp.csr_array],
+    start: Array,
+    *,
+    source: Array | None = None,
+    background: ArrayLike = 0.0,
+    used: NDArray[np.bool_] | None = None,
+    nonnegative: bool = False,
+    least_mean: float = 0.1,
+    tolerance: float = 1e-4,
+    max_iterations: int = 60,
+) -> PoissonFit:
+    """Climb to the maximum of the Poisson likelihood by Fisher scoring.
+
+    Parameters
+    ----------
+    counts:
+        D, shape (P, B), photons or any unit in which the variance is the mean.
+    start:
+        r to start from, shape (K,), such as the Gaussian fit's or the closed form's.
+    source:
+        V to start from in counts, shape (M, B); by least squares from r when left out.
+    background:
+        Known mean of the counts without the card, broadcast to (P, B).
+    used:
+        Which entries count, shape (P, B); saturated ones do not.
+    nonnegative:
+        Keep r >= 0 and V >= 0.
+    least_mean:
+        Counts; where the model's mean falls below, as without bounds it may anywhere and even below zero, the count is
+        taken as normal with this variance, which continues the likelihood smoothly.
+    tolerance:
+        Stop when a full step promises less than this many nats.
+
+    Raises
+    ------
+    InputError
+        For counts or a background below zero, or a least mean that is not above.
+    """
+    if not least_mean > 0:
+        raise InputError(f"is {least_mean:g}; give a small number of counts above zero", field="least_mean")
+    data = _checked(counts, designs, background, used)
+    seen = _seen(designs)
+    r = np.where(seen, start, 0.0)
+    v = np.asarray(_least_squares(data, r) if source is None else source, dtype=np.float64)
+    if nonnegative:
+        # Off zero, where a mean of 0 could never explain a count.
+        r = np.where(seen, np.maximum(r, _START_FLOOR * float(np.max(r))), 0.0)
+        v = np.maximum(v, _START_FLOOR * float(np.max(v)))
+    mean = data.mean(r, v)
+    products = _Products(designs)
+    total = 0.0
+    for iteration in range(1, max_iterations + 1):
+        dr, dv, slope = _scoring_step(data, products, r, v, mean, seen, least_mean, nonnegative=nonnegative)
+        if slope <= tolerance:
+            return _fit(data, r, v, mean, least_mean, total, iteration, converged=True)
+        length = 1.0
+        while True:
+            near_r, near_v = r + length * dr, v + length * dv
+            if nonnegative:
+                near_r, near_v = np.maximum(near_r, 0.0), np.maximum(near_v, 0.0)
+            trial = data.mean(near_r, near_v)
+            gained = data.gained(mean, trial, least_mean)
+            if gained >= 1e-4 * length * slope:
+                break
+            length /= 2
+            if length < 1e-10:
+                return _fit(data, r, v, mean, least_mean, total, iteration, converged=slope <= 1e3 * tolerance)
+        r, v, mean = near_r, near_v, trial
+        total += gained
+    return _fit(data, r, v, mean, least_mean, total, max_iterations, converged=False)
+
+
+def poisson_bound(
+    designs: list[sp.csr_array],
+    coefficients: Array,
+    source: Array,
+    *,
+    gauge: Array,
+    background: ArrayLike = 0.0,
+    used: NDArray[np.bool_] | None = None,
+) -> Bound:
+    """The Cramer-Rao bound of counting at (r, V), in the gauge that holds c r fixed; see `bounds.cramer_rao`.
+
+    Parameters
+    ----------
+    coefficients:
+        r, shape (K,).
+    source:
+        V in counts, shape (M, B).
+    gauge:
+        c, shape (K,): the values of the basis functions at the peak of rho.
+    background:
+        Known mean of the counts without the card, broadcast to (P, B).
+    """
+    shape = (designs[0].shape[0], source.shape[1])
+    data = _checked(np.zeros(shape), designs, background, used)
+    seen = _seen(designs)
+    cells = np.flatnonzero(seen)
+    mean = data.mean(coefficients, source)
+    weights = data.weights(mean, _DARK * float(mean.max()))
+    free = np.ones(source.shape, dtype=bool)
+    schur, inverse, coupled = _information(_Products(designs), coefficients, source, weights, cells, free)
+    c, r = gauge[seen], coefficients[seen]
+    level = float(np.trace(schur)) / max(1, cells.size)
+    strength = level / max(float(c @ c), 1e-300)
+    pinned = schur + strength * np.outer(c, c)
+    # Barely seen cells keep a finite variance by a ridge, which rounding in S, times the condition of H, sets.
+    lost = max(_RIDGE, 4 * np.finfo(np.float64).eps * float(np.max(np.linalg.cond(inverse))))
+
+    def invert(ridge: float) -> Array:
+        identity = np.eye(cells.size)
+        factor = sl.cho_factor(pinned + ridge * identity, lower=True, check_finite=False)
+        covariance = sl.cho_solve(factor, identity, check_finite=False)
+        covariance -= np.outer(r, r) / (strength * float(c @ r) ** 2)
+        return np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)
+
+    covariance = invert(lost * level)
+    error = _scale_free_error(source, inverse, coupled, covariance)
+    # What the ridge alone holds, nothing holds.
+    if lost > 1e-3 or _scale_free_error(source, inverse, coupled, invert(10 * lost * level)) < 0.8 * error:
+        error = float("inf")
+    variance = np.einsum("bii->bi", inverse) + np.einsum("bik,kl,bil->bi", coupled, covariance, coupled, optimize=True)
+    return Bound(
+        coefficients=covariance,
+        seen=seen,
+        source_std=np.sqrt(np.maximum(variance, 0.0)).T,
+        shape_std=_shape_std(source, inverse, coupled, covariance, variance),
+        source_error=error,
+    )
+
+
+def _checked(
+    counts: Array, designs: list[sp.csr_array], background: ArrayLike, used: NDArray[np.bool_] | None
+) -> _Counts:
+    level = np.broadcast_to(np.asarray(background, dtype=np.float64), counts.shape)
+    mask = np.ones(counts.shape, dtype=bool) if used is None else used
+    if np.any((counts < 0) & mask):
+        raise InputError("has entries below zero, which no count is", field="counts")
+    if np.any(level < 0):
+        raise InputError("has entries below zero; give the mean count without the card", field="background")
+    return _Counts(np.asarray(counts, dtype=np.float64), level, mask, designs)
+
+
+def _least_squares(data: _Counts, r: Array) -> Array:
+    """V for a given r with equal weights, shape (M, B)."""
+    transport = _transport(data.designs, r)
+    light = data.counts - data.background
+    columns = zip(light.T, data.used.T)
+    return np.stack([np.linalg.lstsq(transport[used], column[used])[0] for column, used in columns], axis=1)
+
+
+def _seen(designs: list[sp.csr_array]) -> NDArray[np.bool_]:
+    energy = np.zeros(designs[0].shape[1])
+    for t in designs:
+        energy += np.bincount(t.indices, weights=t.data**2, minlength=energy.size)
+    return np.asarray(energy > _SEEN * energy.max())
+
+
+def _transport(designs: list[sp.csr_array], r: Array) -> Array:
+    return np.stack([t @ r for t in designs], axis=1)
+
+
+def _fit(
+    data: _Counts, r: Array, v: Array, mean: Array, least: float, gain: float, iterations: int, *, converged: bool
+) -> PoissonFit:
+    pearson = float(np.sum((data.counts - mean) ** 2 * data.weights(mean, least)))
+    freedom = int(np.count_nonzero(data.used)) - int(np.count_nonzero(r)) - int(np.count_nonzero(v)) + 1
+    return PoissonFit(r, v, gain, pearson / max(1, freedom), iterations, converged)
+
+
+def _scoring_step(
+    data: _Counts,
+    products: _Products,
+    r: Array,
+    v: Array,
+    mean: Array,
+    seen: NDArray[np.bool_],
+    least: float,
+    *,
+    nonnegative: bool,
+) -> tuple[Array, Array, float]:
+    """The step in r and V, and the gain of log-likelihood that its slope promises."""
+    score = data.score(mean, least)
+    transport = _transport(data.designs, r)
+    grad_r = np.sum([t.T @ (score @ v[i]) for i, t in enumerate(data.designs)], axis=0)
+    grad_v = transport.T @ score  # (M, B)
+    free = (v > 0) | (grad_v > 0) if nonnegative else np.ones(v.shape, dtype=bool)
+    grad_v = np.where(free, grad_v, 0.0)
+    cells = np.flatnonzero(seen)
+    schur, inverse, coupled = _information(products, r, v, data.weights(mean, least), cells, free)
+    right = grad_r[cells] - np.einsum("bmk,mb->k", coupled, grad_v)
+    level = float(np.trace(schur)) / max(1, cells.size)
+    here = r[cells]
+    # The gauge r r^T keeps the step off the scale's null direction; the ridge is for barely seen cells.
+    schur += level * np.outer(here, here) / max(float(here @ here), 1e-300)
+    schur[np.diag_indices_from(schur)] += _RIDGE * level
+    dr = np.zeros_like(r)
+    dr[cells] = _step_above(-here, schur, right) if nonnegative else _solve_positive(schur, right)
+    dv = np.einsum("bij,jb->ib", inverse, grad_v) - np.einsum("bik,k->ib", coupled, dr[cells])
+    if nonnegative:
+        dv = np.maximum(dv, -v)
+    return dr, dv, float(grad_r @ dr + np.sum(grad_v * dv))
+
+
+def _information(
+    products: _Products,
+    r: Array,
+    v: Array,
+    weights: Array,
+    cells: NDArray[np.intp],
+    free: NDArray[np.bool_],
+) -> tuple[Array, Array, Array]:
+    """S over the given cells, H_b^-1 (B, M, M) and H_b^-1 C_b (B, M, K'), rows of fixed source entries zero."""
+    m, realisations = v.shape
+    total = products.summed(weights, v)
+    transport = _transport(products.designs, r)
+    normal = np.empty((realisations, m, m))
+    coupling = np.zeros((realisations, m, r.size))
+    for i in range(m):
+        seen_from = weights * transport[:, i : i + 1]  # (P, B)
+        normal[:, i] = seen_from.T @ transport
+        for j, t in enumerate(products.designs):
+            coupling[:, i] += (t.T @ (seen_from * v[j])).T
+    both = free.T[:, :, None] & free.T[:, None, :]
+    trace = np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-300
+    normal = np.where(both, normal, np.eye(m) * trace)
+    inverse = np.where(both, np.linalg.inv(normal + 1e-14 * trace * np.eye(m)), 0.0)
+    coupling = coupling[:, :, cells]
+    coupled = inverse @ coupling
+    schur = total[np.ix_(cells, cells)]
+    schur -= coupling.reshape(-1, cells.size).T @ coupled.reshape(-1, cells.size)
+    return 0.5 * (schur + schur.T), inverse, coupled
+
+
+class _Products:
+    """sum_ij T_i^T diag(q_ij) T_j for any weights, from products of T's entries that are formed once where they fit."""
+
+    def __init__(self, designs: list[sp.csr_array]) -> None:
+        self.designs = designs
+        self.pairs = [(i, j) for j in range(len(designs)) for i in range(j + 1)]
+        rows, size = designs[0].shape
+        widths = [int(np.diff(t.indptr).max(initial=1)) for t in designs]
+        self.kept: list[tuple[NDArray[np.intp], Array]] | None = None
+        if rows * sum(widths[i] * widths[j] for i, j in self.pairs) <= _MOST_PRODUCTS:
+            padded = [_padded(t, w) for t, w in zip(designs, widths)]
+            self.kept = [
+                (
+                    (padded[i][0][:, :, None] * size + padded[j][0][:, None, :]).reshape(rows, -1),
+                    (padded[i][1][:, :, None] * padded[j][1][:, None, :]).reshape(rows, -1),
+                )
+                for i, j in self.pairs
+            ]
+
+    def summed(self, weights: Array, v: Array) -> Array:
+        """sum_b J_b^T W_b J_b, dense (K, K), for weights (P, B) and a pattern (M, B)."""
+        size = self.designs[0].shape[1]
+        upper, diagonal = np.zeros(size * size), np.zeros(size * size)
+        for n, (i, j) in enumerate(self.pairs):
+            q = weights @ (v[i] * v[j])
+            target = diagonal if i == j else upper
+            if self.kept is not None:
+                where, values = self.kept[n]
+                target += np.bincount(where.ravel(), weights=(values * q[:, None]).ravel(), minlength=size * size)
+            else:
+                scaled = self.designs[j].copy()
+                scaled.data = scaled.data * np.repeat(q, np.diff(scaled.indptr))
+                target += sp.csr_array(self.designs[i].T @ scaled).toarray().ravel()
+        upper = upper.reshape(size, size)
+        return np.asarray(diagonal.reshape(size, size) + upper + upper.T)
+
+
+def _padded(design: sp.csr_array, width: int) -> tuple[NDArray[np.intp], Array]:
+    """Columns and values of each row, filled up with zeros in column 0; both (P, width)."""
+    lengths = np.diff(design.indptr)
+    inside = np.arange(width) < lengths[:, None]
+    columns, values = np.zeros(inside.shape, dtype=np.intp), np.zeros(inside.shape)
+    columns[inside], values[inside] = design.indices, design.data
+    return columns, values
