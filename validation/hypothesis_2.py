@@ -2,8 +2,8 @@
 
     python validation/hypothesis_2.py [--quick | --page] [--out FOLDER]
 
-Measures the light of each bounce in 15 scenes (three walls, five surroundings), then solves captures of growing depth
-in four of them with the one-bounce solver. Leaves results/hypothesis_2.json, figures/hypothesis_2.png and the page
+Measures the light of each bounce in 15 scenes (three walls, five surroundings), then answers captures of growing depth
+with a one-bounce model wherever card or box reflect. Leaves results/hypothesis_2.json, figures/hypothesis_2.png and the page
 HYPOTHESIS_2.md in the folder (this one; with --quick, out/hypothesis_2), prints the tables, and leaves with 1 if a
 black card does not give exactly one bounce or a bias was foretold wrong by more than a factor of two.
 """
@@ -33,14 +33,13 @@ from wallmirror.jobs.bouncing import (
     TOLERANCES,
     WALLS,
     Bounces,
-    DepthPrice,
     Measured,
-    Price,
     bounces_scene,
     measure_bounces,
-    price_of_one_bounce,
     summary,
 )
+from wallmirror.jobs.counting_bounces import percent
+from wallmirror.jobs.pricing import PRICE_DEPTHS, DepthPrice, Price, price_of_one_bounce
 from wallmirror.pathtracing.rendering import picture
 
 WALL_TITLES = {"diffuse": "diffuse, albedo 0.5", "lobes": "four lobes, sigma 1°", "mirror": "mirror"}
@@ -52,6 +51,8 @@ SETTING_TITLES = {
     "box_card": "box 0.8, card 0.8 at 1 m",
 }
 SHOWN = (("diffuse", "card_near"), ("diffuse", "box_card"), ("lobes", "box_card"))
+# Narrow lobes close to the card light so little of the wall that fewer samples are refused.
+RARE, RARE_VIEWS, RARE_SPP = "bounces_lobes_card_near", 20, 1024
 FULL = {"seeds": 8, "terms_spp": 256, "sets": 2, "views": 8, "spp": 256, "width": 320, "picture_spp": 128}
 QUICK = {"seeds": 4, "terms_spp": 256, "sets": 2, "views": 5, "spp": 256, "width": 160, "picture_spp": 16}
 
@@ -59,7 +60,9 @@ QUICK = {"seeds": 4, "terms_spp": 256, "sets": 2, "views": 5, "spp": 256, "width
 def priced_scenes(quick: bool) -> list[Scene]:
     satin = load_scene("reflective_card")
     near = replace(satin, name="reflective_card_near", card=replace(satin.card, y=-0.25))
-    return [near] if quick else [satin, near, load_scene("cornell_lobes"), bounces_scene("lobes", "box_card")]
+    if quick:
+        return [near]
+    return [satin, near, *(bounces_scene(wall, s) for wall in WALLS for s in SETTINGS if s != "black")]
 
 
 def pictures(scenes: list[Scene], width: int, spp: int) -> bytes:
@@ -83,14 +86,6 @@ def pictures(scenes: list[Scene], width: int, spp: int) -> bytes:
     return stream.getvalue()
 
 
-def percent(measured: Measured) -> str:
-    if math.isnan(measured.value):
-        return "–"
-    error = 100 * measured.error
-    digits = 0 if error <= 0 else max(0, min(6, 1 - math.floor(math.log10(error))))
-    return f"{100 * measured.value:.{digits}f} ± {error:.{digits}f} %" if error > 0 else f"{100 * measured.value:.3g} %"
-
-
 def table(header: list[str], rows: list[list[str]]) -> str:
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
@@ -110,7 +105,6 @@ def series_table(cells: dict[tuple[str, str], Bounces]) -> str:
         if b.exact:
             continue
         late = [r for r in b.ratios[1:] if math.isfinite(r.value)]
-        bound = "none" if math.isinf(b.tail_bound) else f"{100 * b.tail_bound:.2g} %"
         rows.append(
             [
                 f"`{b.scene}`",
@@ -118,7 +112,7 @@ def series_table(cells: dict[tuple[str, str], Bounces]) -> str:
                 percent(b.ratios[0]),
                 percent(late[-1]) if late else "–",
                 percent(b.rest),
-                bound,
+                f"{100 * b.tail_bound:.2g} %",
                 " / ".join(b.verdict(tolerance) for tolerance in TOLERANCES),
             ]
         )
@@ -127,37 +121,48 @@ def series_table(cells: dict[tuple[str, str], Bounces]) -> str:
 
 
 def price_table(prices: list[Price]) -> str:
+    """At all bounces: what the one-bounce answer is worth, and what was foretold."""
+
+    def both(values: list[float]) -> str:
+        return "–" if any(map(math.isnan, values)) else " → ".join(f"{100 * v:.2f}" for v in values) + " %"
+
     rows = []
     for price in prices:
-        for d in price.depths:
-            ratio = d.predicted_bias / d.bias if d.depth == DEEP and d.bias > 0 else math.nan
-            rows.append(
-                [
-                    f"`{price.scene}`" if d is price.depths[0] else "",
-                    str(d.depth),
-                    f"{100 * d.source_error:.2f} %",
-                    f"{100 * d.brdf_error:.2f} %",
-                    f"{100 * d.predicted_error:.2f} %",
-                    f"{d.chi_squared:.3f}",
-                    f"{100 * d.bias:.2f} ± {100 * d.bias_error:.2f} %",
-                    f"{100 * d.predicted_bias:.2f} %",
-                    "" if math.isnan(ratio) else f"{ratio:.2f}",
-                    d.verdict,
-                ]
-            )
-    header = [
-        "scene",
-        "depth",
-        "V off",
-        "BRDF off",
-        "error bars",
-        "misfit / noise",
-        "bias",
-        "foretold",
-        "ratio",
-        "verdict",
-    ]
+        one, deep = price.depths[0], price.depths[-1]
+        rows.append(
+            [
+                f"`{price.scene}`",
+                both([one.source_error, deep.source_error]),
+                both([one.brdf_error, deep.brdf_error]),
+                f"{100 * deep.predicted_error:.2f} %",
+                "–" if math.isnan(deep.chi_squared) else f"{deep.chi_squared:.2f}",
+                f"{100 * deep.bias:.2f} ± {100 * deep.bias_error:.2f} %" if deep.bias > 1e-9 else "0",
+                f"{100 * deep.predicted_bias:.2f} %" if deep.predicted_bias > 0 else "0",
+                "–" if math.isnan(price.foretold) else f"{price.foretold:.2f}",
+                deep.verdict,
+            ]
+        )
+    header = ["scene", "V off", "BRDF off", "error bars", "misfit / noise", "bias", "foretold", "ratio", "verdict"]
     return table(header, rows)
+
+
+def depth_table(prices: list[Price]) -> str:
+    """Errors of pattern and BRDF by the depth of the captures."""
+
+    def cell(d: DepthPrice) -> str:
+        brdf = "–" if math.isnan(d.brdf_error) else f"{100 * d.brdf_error:.2f}"
+        return f"{100 * d.source_error:.2f} / {brdf}"
+
+    rows = [[f"`{price.scene}`", *(cell(d) for d in price.depths)] for price in prices]
+    return table(["V / BRDF off, in %", *(f"depth {d}" for d in PRICE_DEPTHS)], rows)
+
+
+def foretold_well(price: Price) -> bool:
+    """Within a factor of two, or no bias that stands out of the noise and none foretold beyond the error bars."""
+    deep = price.depths[-1]
+    if math.isnan(price.foretold):
+        return deep.predicted_bias <= deep.predicted_error
+    return 0.5 <= price.foretold <= 2
 
 
 def page(cells: dict[tuple[str, str], Bounces], prices: list[Price], settings: dict[str, int], seconds: float) -> str:
@@ -167,15 +172,17 @@ def page(cells: dict[tuple[str, str], Bounces], prices: list[Price], settings: d
     worst = max(lit, key=lambda b: b.beyond.value)
     least = min(lit, key=lambda b: b.beyond.value)
     deep = [p.depths[-1] for p in prices]
-    dearest = max(deep, key=lambda d: d.bias / d.predicted_error)
+    blind = [d for d in deep if d.verdict != "known"]
+    dearest = max(blind, key=lambda d: d.bias / d.predicted_error)
     dearest_scene = prices[deep.index(dearest)].scene
-    hurt = max(prices, key=lambda p: p.depths[-1].brdf_error / p.depths[0].brdf_error)
+    sought = [p for p in prices if p.depths[-1] in blind]
+    hurt = max(sought, key=lambda p: p.depths[-1].brdf_error / p.depths[0].brdf_error)
     quiet = [p.scene for p in prices if p.depths[-1].chi_squared < 1.2]
-    silent = [p.scene for p in prices if all(d.verdict == "good" for d in p.depths)]
-    met = [p.scene for p in prices if 0.5 <= p.foretold <= 2]
-    missed = [p.scene for p in prices if not 0.5 <= p.foretold <= 2]
+    silent = [p.scene for p in prices if p.depths[-1].verdict == "good"]
+    ratios = [p.foretold for p in prices if not math.isnan(p.foretold)]
+    met = [p.scene for p in prices if foretold_well(p) and not math.isnan(p.foretold)]
+    missed = [p.scene for p in prices if not foretold_well(p)]
     beyond = [b.scene for b in lit if b.rest.low > b.tail_bound]
-    unbounded = [b.scene for b in lit if math.isinf(b.tail_bound)]
 
     made_by = "`python validation/hypothesis_2.py`; numbers in `results/hypothesis_2.json`"
 
@@ -216,32 +223,40 @@ T^k L_e is light that was reflected k times, measured as the difference of depth
 numbers, in units of the one-bounce light. A plane wall and a plane card cannot light themselves, so in the open only
 odd k carry light: "depth 3" adds nothing there, and a test that compares depths 2 and 3 would find Hypothesis 2 proven.
 q = T^(k+2) L_e / T^k L_e is the ratio over such a round trip, for k = 1 and for the last k measured. The bound on the
-tail is geometric, with the upper 99 % limit of the last ratios and once more their last growth; it is an extrapolation,
-and the column before it, rendered, is the check: {kept}.
-"None" ({named(unbounded)}) is where the ratios' limit is not below 1.
+tail is geometric, with the upper 99 % limit of the last ratios and once more their last growth, or 0.8, which is all that
+card and box can send back, if that is less; it is an extrapolation, and the column before it, rendered, is the check:
+{kept}.
 Errors are standard errors over {settings["seeds"]} seeds; verdicts use 99 % intervals.
 
 {series_table(cells)}
 
 ## What failing costs
 
-Captures of growing depth ({settings["views"]} views, 4 patterns, {settings["spp"]} samples per pixel, {settings["sets"]} sets),
-solved by the one-bounce solver. "Bias" is how far the pattern V moved from the solution at depth 2 with the same random
-numbers, noise taken out; "foretold" is what the a-priori check said from geometry, albedo and the recovered BRDF.
+Captures of growing depth ({settings["views"]} views, 4 patterns, {settings["spp"]} samples per pixel, {settings["sets"]} sets;
+`{RARE}`: {RARE_VIEWS} views of {RARE_SPP}, since fewer are refused), answered by a one-bounce model. "Bias" is how far
+the pattern V moved from the answer at depth 2 with the same random numbers, noise taken out; "foretold" is what the
+a-priori check said from geometry, albedo and the recovered BRDF; "a → b": at one bounce and at {DEEP - 1}.
 `reflective_card` is a satin wall (four lobes of 5° over a diffuse coat) before a card at 1 m; `_near`: at 0.25 m.
+A mirror's pattern is not sought blindly but read off by least squares ("known").
 
 {price_table(prices)}
 
+- The check was to foretell the bias within a factor of 2. It does in {len(met)} of the {len(met) + len(missed)} scenes whose
+  bias stands out of the noise; not in {named(missed)}. The ratios lie between {min(ratios):.2f} and {max(ratios):.2f};
+  above 1 the check errs on the side of warning.
 - The dearest case is `{dearest_scene}`: the bias is {dearest.bias / dearest.predicted_error:.1f} times the solver's own error
   bars, at a misfit of {dearest.chi_squared:.2f} times the noise.
 - A misfit below 1.2 times the noise raises no doubt: {named(quiet)}.
-- Neither fit nor check objects, all depths: {named(silent)}; the bias is below half the error bars there.
-- The check was to foretell the bias within a factor of 2. It does in {named(met)}; it
-  does not in {named(missed)} (see "ratio", and the error of "bias"). It errs on the side of warning where the ratio exceeds 1.
-- The BRDF suffers as well, at most in `{hurt.scene}`: {100 * hurt.depths[0].brdf_error:.1f} % off at depth 2 becomes
+- Neither fit nor check objects: {named(silent)}; the bias is below half the error bars there.
+- The BRDF suffers as well, at most in `{hurt.scene}`: {100 * hurt.depths[0].brdf_error:.1f} % off at one bounce becomes
   {100 * hurt.depths[-1].brdf_error:.1f} %. The check foretells the pattern's bias only.
-- The check needs a BRDF of the angle sum. A mirror has none, so it says nothing about the mirror's cells.
-- At depth 2 the check still warns: it knows the card's albedo, not that the renderer stopped there.
+- The mirror in the box shows the box, but no strip is brighter for it: its bias is 0, and 0 was foretold. With box and
+  card the forecast knows the card alone.
+- The check cannot know where a renderer stopped: it warns of captures at depth 2 too, if the card reflects.
+
+Depth by depth, a depth of k + 1 holding k bounces:
+
+{depth_table(prices)}
 
 Made in {seconds / 60:.0f} min on 2 shared cores by {made_by}
 (`--page` rewrites this page and the figure from them).
@@ -254,6 +269,9 @@ def recall(document: dict) -> tuple[dict[tuple[str, str], Bounces], list[Price]]
     def measured(entry: dict) -> Measured:
         return Measured(**{key: math.nan if value is None else value for key, value in entry.items()})
 
+    def priced(entry: dict) -> DepthPrice:
+        return DepthPrice(**{key: math.nan if value is None else value for key, value in entry.items()})
+
     series = [
         Bounces(
             scene=b["scene"],
@@ -261,13 +279,14 @@ def recall(document: dict) -> tuple[dict[tuple[str, str], Bounces], list[Price]]
             rest=measured(b["rest"]),
             beyond=measured(b["beyond"]),
             ratios=tuple(measured(r) for r in b["ratios"].values()),
-            tail_bound=math.inf if b["tail_bound"] is None else b["tail_bound"],
+            largest_ratio=b["largest_ratio"],
+            tail_bound=b["tail_bound"],
             exact=b["exact"],
         )
         for b in document["bounces"]
     ]
     prices = [
-        Price(scene=p["scene"], wall_albedo=p["wall_albedo"], depths=tuple(DepthPrice(**d) for d in p["depths"]))
+        Price(scene=p["scene"], wall_albedo=p["wall_albedo"], depths=tuple(priced(d) for d in p["depths"]))
         for p in document["prices"]
     ]
     cells = [(wall, setting) for wall in WALLS for setting in SETTINGS]
@@ -299,21 +318,27 @@ def main() -> int:
             print(f"{result.scene:<28} {'0 exactly' if result.exact else percent(result.beyond)}", flush=True)
     prices = []
     for scene in priced_scenes(arguments.quick):
-        price = price_of_one_bounce(scene, views=settings["views"], spp=settings["spp"], sets=settings["sets"])
+        rare = scene.name == RARE
+        price = price_of_one_bounce(
+            scene,
+            views=RARE_VIEWS if rare else settings["views"],
+            spp=RARE_SPP if rare else settings["spp"],
+            sets=settings["sets"],
+        )
         prices.append(price)
         deep = price.depths[-1]
         print(f"{price.scene:<28} bias {100 * deep.bias:.2f} %, foretold {100 * deep.predicted_bias:.2f} %", flush=True)
     write_atomically(out / "figures" / "hypothesis_2.png", pictures(shown, settings["width"], settings["picture_spp"]))
     seconds = time.perf_counter() - started
     exact = all(cells[wall, "black"].exact for wall in WALLS)
-    foretold = all(0.5 <= price.foretold <= 2 for price in prices)
+    foretold = all(foretold_well(price) for price in prices)
     document = {
         "settings": settings,
         "seconds": seconds,
         "black_card_exact": exact,
         "bias_foretold_within_2x": foretold,
         "bounces": [summary(b) for b in cells.values()],
-        "prices": [summary(p) for p in prices],
+        "prices": [p.summary() for p in prices],
     }
     text = page(cells, prices, settings, seconds)
     write_atomically(out / "HYPOTHESIS_2.md", text)

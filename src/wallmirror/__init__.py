@@ -19,6 +19,7 @@ from wallmirror.brdf import (
 from wallmirror.captures import CaptureSet, Truth, read_captures, read_truth, write_captures
 from wallmirror.comparison import BiasTest, Comparison, compare
 from wallmirror.derendering.estimate import scale_free_error
+from wallmirror.derendering.foresight import Forecast, foresee
 from wallmirror.derendering.solution import Solution
 from wallmirror.derendering.solve import solve
 from wallmirror.errors import InputError, MissingRuntimeError, UndeterminedError, WallmirrorError
@@ -44,6 +45,7 @@ __all__ = [
     "Card",
     "Comparison",
     "Diffuse",
+    "Forecast",
     "GaussianTrain",
     "InputError",
     "Kernel",
@@ -64,6 +66,7 @@ __all__ = [
     "brdf_matrices",
     "build_kernel",
     "compare",
+    "foresee",
     "load_scene",
     "mirror_matrix",
     "radiance",

@@ -162,14 +162,29 @@ def capture(
 def solve(
     directory: Annotated[Path, typer.Argument(help="Folder with captures.toml and its EXR files.")],
     out: Out = Path("out/solution"),
-    method: Annotated[str, typer.Option(help="auto, closed_form or maximum_likelihood.")] = "auto",
+    method: Annotated[
+        str, typer.Option(help="auto, closed_form, maximum_likelihood, few_captures or poisson.")
+    ] = "auto",
     nonnegative: Annotated[bool, typer.Option(help="Keep BRDF and pattern >= 0.")] = True,
+    support_deg: Annotated[
+        float | None, typer.Option(help="Few captures: the BRDF is 0 beyond this angle sum (degrees).")
+    ] = None,
     step_deg: Annotated[
         float | None, typer.Option(help="Knot spacing of the BRDF; the data choose if left out.")
     ] = None,
+    counts: Annotated[float | None, typer.Option(help="Poisson: counts that a radiance of 1 makes.")] = None,
+    background: Annotated[float, typer.Option(help="Poisson: mean counts of an unlit pixel.")] = 0.0,
+    calibrate: Annotated[
+        bool, typer.Option("--calibrate", help="Find the card's offset, distance and width from the captures first.")
+    ] = False,
+    scale: Annotated[str, typer.Option(help="What settles the scale: peak, albedo or level.")] = "peak",
     wall_albedo: Annotated[
-        float | None, typer.Option(help="The wall's albedo, if known, for the one-bounce check.")
+        float | None, typer.Option(help="The wall's albedo, if known, for the one-bounce check and --scale albedo.")
     ] = None,
+    source_level: Annotated[
+        float | None, typer.Option(help="The pattern's mean radiance, if known, for --scale level.")
+    ] = None,
+    seed: Seed = 0,
     as_json: AsJson = False,
 ) -> None:
     """Recover the card's pattern and the wall's BRDF from a capture set, with error bars and certificates."""
@@ -179,12 +194,21 @@ def solve(
     solved = solve_directory(
         directory,
         out,
+        calibrated=calibrate,
+        progress=terminal.note,
         method=method,  # type: ignore[arg-type]  # `solve` checks it and names the choices
         nonnegative=nonnegative,
+        support_deg=support_deg,
         step_deg=step_deg,
+        counts_per_radiance=counts,
+        background=background,
+        scale=scale,  # type: ignore[arg-type]
         wall_albedo=wall_albedo,
-        progress=terminal.note,
+        source_level=source_level,
+        seed=seed,
     )
+    if solved.calibration is not None:
+        terminal.say(solved.calibration.status)
     solution = solved.solution
     terminal.say(solution.status)
     for warning in solution.warnings[1:]:

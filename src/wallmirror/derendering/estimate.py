@@ -32,6 +32,8 @@ class Estimate:
         Standard deviation of V after the best global scale, shape (M, B).
     brdf_std:
         Standard deviation of rho at given angle sums.
+    priors:
+        What the answer rests on beside the captures, in words.
     """
 
     method: str
@@ -47,6 +49,7 @@ class Estimate:
     predicted_error: float
     chi_squared: float
     warnings: tuple[str, ...]
+    priors: tuple[str, ...] = ()
 
 
 def scale_free_error(estimate: Array, truth: Array) -> float:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
-from wallmirror.derendering.subspace import SignalSpace, signal_space, space_within
+from wallmirror.derendering.subspace import SignalSpace, noise_edge, signal_space, space_within
 from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card
 from wallmirror.transport import build_kernel
@@ -98,8 +98,17 @@ class Problem:
         return grid, design_matrices(kernel, grid)
 
 
-def prepare(captures: CaptureSet) -> tuple[Problem, SignalSpace]:
+def prepare(
+    captures: CaptureSet, *, few_captures: bool = False, weak_patterns: bool = False
+) -> tuple[Problem, SignalSpace]:
     """Normalise a capture set and find the space of its patterns.
+
+    Parameters
+    ----------
+    few_captures:
+        Let captures of any number and rank pass, for a solver that does not stand on their space.
+    weak_patterns:
+        Let a rank below M pass where noise, not rounding, hides the rest: a fit of the whole model may find them still.
 
     Raises
     ------
@@ -113,10 +122,10 @@ def prepare(captures: CaptureSet) -> tuple[Problem, SignalSpace]:
             "two elements of the card stand at the same place, so their light cannot be told apart; give each its "
             "own position"
         )
-    if realisations < elements:
+    if realisations < elements and not few_captures:
         raise UndeterminedError(
             f"{realisations} realisation(s) of the pattern cannot determine {elements} elements; capture at least "
-            f"{elements} different patterns"
+            f"{elements} different patterns, or use the method for few captures"
         )
     if views * pixels <= elements:
         raise UndeterminedError(
@@ -134,7 +143,9 @@ def prepare(captures: CaptureSet) -> tuple[Problem, SignalSpace]:
             inverse = None if np.all(inverse > 0) else (inverse > 0).astype(np.float64)
     stated = inverse is not None and not captures.variance_is_floor
     problem = Problem(captures, data / scale, inverse, noisy, stated, scale)
-    return problem, _signal_space(problem)
+    if few_captures:
+        return problem, signal_space(problem.weighted_data, elements)
+    return problem, _signal_space(problem, weak_patterns=weak_patterns)
 
 
 def _inverse_variance(variance: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -145,28 +156,37 @@ def _inverse_variance(variance: Array) -> tuple[Array, NDArray[np.bool_]]:
     return np.where(finite, 1.0 / np.maximum(variance, floor), 0.0), finite & (variance > floor)
 
 
-def _signal_space(problem: Problem) -> SignalSpace:
+def too_few_patterns(found: int, elements: int) -> UndeterminedError:
+    """The refusal of captures whose patterns do not stand out of the noise."""
+    return UndeterminedError(
+        f"the captures span only {found} independent pattern(s) above the noise, but the card has "
+        f"{elements} elements; capture more different patterns, or more light"
+    )
+
+
+def _signal_space(problem: Problem, *, weak_patterns: bool) -> SignalSpace:
     """The leading M directions, with the rank counted above the noise's largest singular value."""
     rows, realisations = problem.data.shape
     elements = problem.card.elements
-    # Noise of unit variance reaches singular values of about sqrt(P) + sqrt(B) (Marchenko and Pastur 1967).
-    floor = math.sqrt(rows) + math.sqrt(realisations) if problem.noise_is_stated else 0.0
+    floor = noise_edge(rows, realisations) if problem.noise_is_stated else 0.0
     space = signal_space(problem.weighted_data, elements, noise_floor=floor)
     if not problem.noise_is_stated and realisations > elements:
+        # The singular values beyond M are noise, those at the lower edge of its spectrum if nothing better is known.
         tail = float(np.sqrt(np.mean(space.singular_values[elements:] ** 2)))
-        floor = tail * (1 + math.sqrt(realisations / rows))
+        floor = tail / max(0.5, 1 - math.sqrt(realisations / rows)) / math.sqrt(rows) * noise_edge(rows, realisations)
         rank = int(np.count_nonzero(space.singular_values[:elements] > floor))
         space = replace(space, rank=min(rank, space.rank))
-    for step in _PROJECTION_STEPS:
+    if space.rank == elements:
+        return space
+    certain = floor < _ROUNDING * space.singular_values[0]
+    for step in () if certain else _PROJECTION_STEPS:
         # Where patterns drown in the films, the finest BRDF grid in whose span they stand out is taken.
-        if space.rank >= elements or floor < _ROUNDING * space.singular_values[0]:
-            break
         _, designs = problem.designs(step, degree=3, tolerance=1e-4)
         noise = 1.0 if problem.noise_is_stated else None
-        space = space_within(problem.weighted_data, problem.weighted(designs), elements, noise=noise)
-    if space.rank < elements:
-        raise UndeterminedError(
-            f"the captures span only {space.rank} independent pattern(s) above the noise, but the card has "
-            f"{elements} elements; capture more different patterns, or more light"
-        )
+        within = space_within(problem.weighted_data, problem.weighted(designs), elements, noise=noise)
+        if within.rank == elements:
+            return within
+        space = within if within.rank > space.rank else space
+    if certain or not weak_patterns:
+        raise too_few_patterns(space.rank, elements)
     return space

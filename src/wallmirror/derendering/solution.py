@@ -6,21 +6,34 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wallmirror.brdf import AngleSumTable
+from wallmirror.derendering.components import components
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.one_bounce import OneBounceCheck
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace
-from wallmirror.errors import UndeterminedError
+from wallmirror.errors import InputError, UndeterminedError
+from wallmirror.interreflection import directional_albedo
 
 Array = NDArray[np.float64]
 
 Verdict = Literal["good", "doubtful"]
 
+#: What settles the global scale: max rho = 1, a known albedo of the wall, or a known mean level of the pattern.
+Scale = Literal["peak", "albedo", "level"]
+
+_HOW = {
+    "closed_form": "in closed form",
+    "maximum_likelihood": "by maximum likelihood",
+    "few_captures": "from few captures",
+    "poisson": "by the likelihood of counts",
+}
+_FITS = ("maximum_likelihood", "poisson")
 # Error bars beyond this share of the pattern mean that the data do not determine it.
 _UNDETERMINED = 0.5
 _CURVE_NODES = 2401
@@ -28,6 +41,60 @@ _CURVE_NODES = 2401
 _BIAS_TOLD = 0.5
 # Below this the closed form's gap is as good as none.
 _NO_GAP = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gauge:
+    """The choice of the one scale that no capture can tell.
+
+    Parameters
+    ----------
+    scale:
+        "peak": max rho = 1; "albedo": the directional albedo at normal incidence is `wall_albedo`; "level": the mean of
+        V is `source_level`.
+    """
+
+    scale: Scale = "peak"
+    wall_albedo: float | None = None
+    source_level: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.scale not in get_args(Scale):
+            raise InputError(f'is "{self.scale}"; choose one of {", ".join(get_args(Scale))}', field="scale")
+        if self.wall_albedo is not None and not 0 < self.wall_albedo <= 1:
+            raise InputError(f"is {self.wall_albedo:g}; an albedo lies between 0 and 1", field="wall_albedo")
+        if self.source_level is not None and not 0 < self.source_level < math.inf:
+            raise InputError(f"is {self.source_level:g}; give the pattern's mean radiance > 0", field="source_level")
+        if self.scale == "albedo" and self.wall_albedo is None:
+            raise InputError('the scale "albedo" needs the albedo; give it', field="wall_albedo")
+        if self.scale == "level" and self.source_level is None:
+            raise InputError('the scale "level" needs the mean radiance of the pattern; give it', field="source_level")
+
+    @property
+    def words(self) -> str:
+        """The gauge in a few words."""
+        match self.scale:
+            case "albedo":
+                return f"directional albedo of the wall = {self.wall_albedo:g}"
+            case "level":
+                return f"mean of the pattern = {self.source_level:g}"
+            case _:
+                return "max rho = 1"
+
+    def factor(self, angle_sum: Array, brdf: Array, source: Array) -> float:
+        """What a BRDF of peak 1 is to be multiplied with, and its pattern divided by."""
+        match self.scale:
+            case "albedo":
+                assert self.wall_albedo is not None
+                nodes = np.linspace(angle_sum[0], angle_sum[-1], angle_sum.size)
+                values = np.maximum(np.interp(nodes, angle_sum, brdf), 0.0)
+                table = AngleSumTable(start=float(nodes[0]), stop=float(nodes[-1]), values=values)
+                return self.wall_albedo / directional_albedo(table)
+            case "level":
+                assert self.source_level is not None
+                return float(np.mean(source)) / self.source_level
+            case _:
+                return 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,9 +110,14 @@ class Solution:
     warnings:
         One sentence for each reason to doubt.
     method:
-        "closed_form" or "maximum_likelihood".
+        "closed_form", "maximum_likelihood", "few_captures" or "poisson".
+    gauge:
+        What settles the global scale, in words.
+    priors:
+        What the answer rests on beside the captures, in words; empty where the captures alone decide.
     source, source_std:
-        V and its standard deviations, shape (M, B), in the gauge where the well-seen part of the BRDF peaks at 1.
+        V and its standard deviations, shape (M, B), in the gauge that was chosen: by default the one where the
+        well-seen part of the BRDF peaks at 1. They leave out what is not known of a scale that was given.
     shape_std:
         Standard deviation of V after the best global scale, which nobody can know, shape (M, B).
     angle_sum, brdf, brdf_std:
@@ -81,6 +153,8 @@ class Solution:
     verdict: Verdict
     warnings: tuple[str, ...]
     method: str
+    gauge: str
+    priors: tuple[str, ...]
     source: Array = field(repr=False)
     source_std: Array = field(repr=False)
     shape_std: Array = field(repr=False)
@@ -126,7 +200,8 @@ class Solution:
             **{k: _finite(v) for k, v in scalars.items()},
             "warnings": list(self.warnings),
             "one_bounce": None if self.one_bounce is None else asdict(self.one_bounce),
-            "gauge": "max rho = 1",
+            "gauge": self.gauge,
+            "priors": list(self.priors),
             "source": _finite(self.source.tolist()),
             "source_std": _finite(self.source_std.tolist()),
             "shape_std": _finite(self.shape_std.tolist()),
@@ -143,9 +218,10 @@ def conclude(
     estimate: Estimate,
     one_bounce: OneBounceCheck | None,
     *,
+    gauge: Gauge,
     seconds: Callable[[], float],
 ) -> Solution:
-    """Put an estimate into the gauge max rho = 1, attach its certificates and say in words how far to trust it.
+    """Put an estimate into the gauge that was chosen, attach its certificates and say in words how far to trust it.
 
     Raises
     ------
@@ -153,10 +229,15 @@ def conclude(
         When several BRDFs explain the data alike, or the error bars are as large as the pattern.
     """
     closed, grid = estimate.closed, estimate.grid
+    u = np.unique(np.append(np.linspace(grid.start, grid.stop, _CURVE_NODES), estimate.peak_at))
+    curve = grid.evaluate(estimate.coefficients, u)
     # A gap of rounding's size leaves the fit nothing to choose by, and its error bars no way to know.
     if closed.near_solutions > 1 and (estimate.method == "closed_form" or closed.gap < _NO_GAP):
+        groups = components(problem.captures, u, curve)
+        apart = "; ".join("element" + ("s " if len(g) > 1 else " ") + ", ".join(str(i + 1) for i in g) for g in groups)
+        tied = f" ({apart} share no angle of the BRDF, so each group has a scale of its own)" if len(groups) > 1 else ""
         raise UndeterminedError(
-            f"{closed.near_solutions} different BRDFs explain the captures equally well (gap {closed.gap:.1e}); use a "
+            f"{closed.near_solutions} different BRDFs explain the captures equally well{tied}, gap {closed.gap:.1e}; use a "
             "card or views whose reflections share more angles"
         )
     if not estimate.predicted_error <= _UNDETERMINED:
@@ -164,14 +245,12 @@ def conclude(
             f"the captures leave the pattern undetermined (its error bars come to {100 * estimate.predicted_error:.0f} "
             "% of it); capture more light, more views or more patterns"
         )
-    u = np.unique(np.append(np.linspace(grid.start, grid.stop, _CURVE_NODES), estimate.peak_at))
-    curve = grid.evaluate(estimate.coefficients, u)
     peak = float(grid.evaluate(estimate.coefficients, estimate.peak_at))
     views, pixels, _ = problem.captures.radiance.shape
     missed = np.linalg.norm(problem.data - estimate.transport @ estimate.source)
     warnings = list(estimate.warnings)
-    expected = _expected_mismatch(problem, space, closed)
-    if estimate.method != "closed_form" and closed.mismatch > 10 * expected and closed.mismatch > 1e-6:
+    expected = expected_mismatch(problem, space, closed)
+    if estimate.method in _FITS and closed.mismatch > 10 * expected and closed.mismatch > 1e-6:
         warnings.append(
             f"the closed form misses the data's space by {closed.mismatch:.1e} where noise explains {expected:.1e}, so "
             "the geometry, Hypothesis 2 (one bounce) or Hypothesis 8 (angle sum) does not hold"
@@ -184,24 +263,29 @@ def conclude(
             f"which turns the pattern by about {100 * one_bounce.bias:.2g} % (at the {basis} wall albedo of "
             f"{one_bounce.wall_albedo:.2g}) and does not show in the residual",
         )
+    source = estimate.source * peak * problem.scale
+    factor = gauge.factor(u, curve / peak, source)
+    per = peak / factor  # what the estimate's BRDF is divided by
     return Solution(
         status=_status(problem, estimate, warnings),
         verdict="doubtful" if warnings else "good",
         warnings=tuple(warnings),
         method=estimate.method,
-        source=estimate.source * peak * problem.scale,
-        source_std=estimate.source_std * peak * problem.scale,
-        shape_std=estimate.shape_std * peak * problem.scale,
+        gauge=gauge.words,
+        priors=estimate.priors,
+        source=estimate.source * per * problem.scale,
+        source_std=estimate.source_std * per * problem.scale,
+        shape_std=estimate.shape_std * per * problem.scale,
         angle_sum=u,
-        brdf=curve / peak,
-        brdf_std=estimate.brdf_std(u) / peak,
-        transport=(estimate.transport / peak).reshape(views, pixels, -1),
-        rank=space.rank,
+        brdf=curve / per,
+        brdf_std=estimate.brdf_std(u) / per,
+        transport=(estimate.transport / per).reshape(views, pixels, -1),
+        rank=space.rank if estimate.method == "few_captures" else problem.card.elements,
         mismatch=closed.mismatch,
         mismatch_expected=expected,
         gap=closed.gap,
         condition=float(np.linalg.cond(estimate.transport)),
-        components=1,
+        components=1,  # more scales than one are refused above
         predicted_error=estimate.predicted_error,
         residual=float(missed / np.linalg.norm(problem.data)),
         chi_squared=estimate.chi_squared,
@@ -211,7 +295,7 @@ def conclude(
     )
 
 
-def _expected_mismatch(problem: Problem, space: SignalSpace, closed: ClosedForm) -> float:
+def expected_mismatch(problem: Problem, space: SignalSpace, closed: ClosedForm) -> float:
     """1 - lambda_1 that noise alone makes in P dimensions: s^2 (P - M) |V^+|^2 / |F|^2, from first-order perturbation of U.
 
     s^2 is 1 where the rows are whitened by stated variances, else the mean square of the singular values beyond M.
@@ -229,10 +313,13 @@ def _expected_mismatch(problem: Problem, space: SignalSpace, closed: ClosedForm)
 
 
 def _status(problem: Problem, estimate: Estimate, warnings: list[str]) -> str:
-    how = "in closed form" if estimate.method == "closed_form" else "by maximum likelihood"
+    how = _HOW[estimate.method]
+    if estimate.priors:
+        how += f" (given {' and '.join(estimate.priors)})"
+    plural = "" if problem.data.shape[1] == 1 else "s"
     found = (
-        f"Recovered {problem.card.elements} elements in {problem.data.shape[1]} patterns {how}; expect the pattern to be "
-        f"{100 * estimate.predicted_error:.2g} % off, up to one global scale."
+        f"Recovered {problem.card.elements} elements in {problem.data.shape[1]} pattern{plural} {how}; expect the pattern "
+        f"to be {100 * estimate.predicted_error:.2g} % off, up to one global scale."
     )
     if not warnings:
         return f"{found} No certificate objects."

@@ -104,6 +104,17 @@ def signal_space(data: Array, elements: int, *, noise_floor: float = 0.0) -> Sig
     return SignalSpace(q @ left[:, :elements], values, rank, data.shape[0])
 
 
+def noise_edge(rows: int, columns: int) -> float:
+    """Singular value that noise of unit variance in a matrix of this size exceeds in one case of ten thousand.
+
+    The edge sqrt(rows) + sqrt(columns) of Marchenko and Pastur (1967), and beyond it 4.4 units of the scale on which the
+    largest eigenvalue scatters by the law of Tracy and Widom (Johnstone, Annals of Statistics 29(2), 2001).
+    """
+    edge = math.sqrt(rows) + math.sqrt(columns)
+    scale = edge * (1 / math.sqrt(rows) + 1 / math.sqrt(columns)) ** (1 / 3)
+    return math.sqrt(edge**2 + 4.4 * scale)
+
+
 def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noise: float | None) -> SignalSpace:
     """U from the data's projection onto what any BRDF on the designs' grid could make of any pattern.
 
@@ -129,7 +140,7 @@ def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noi
     if noise is None:
         rest = max(0.0, float(np.sum(data * data) - np.sum(projected * projected)))
         noise = math.sqrt(rest / max(1, (data.shape[0] - dimensions) * data.shape[1]))
-    floor = noise * (math.sqrt(dimensions) + math.sqrt(data.shape[1]))
+    floor = noise * noise_edge(dimensions, data.shape[1])
     # The span's weakest directions are known to the root of what was kept of them, no better.
     rounding = 1e-7 * singular[0]
     rank = int(np.count_nonzero(singular[:elements] > max(rounding, floor)))

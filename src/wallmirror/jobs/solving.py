@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet, Truth, read_captures, read_truth
+from wallmirror.derendering.calibration import Calibration, calibrate
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.solution import Solution
-from wallmirror.derendering.solve import Method, solve
+from wallmirror.derendering.solve import SolveOptions, solve
 from wallmirror.files import write_atomically
 from wallmirror.report import FigureBlock, Section, TableBlock, Verdict, write_page
 from wallmirror.report.figures import recovered_brdf, recovered_source, scene_plan, source_deviations
@@ -48,6 +50,7 @@ class Solved:
     solution: Solution
     truth: Truth | None
     judgement: Judgement | None
+    calibration: Calibration | None = None
 
     def summary(self) -> dict[str, Any]:
         """The JSON document of the command."""
@@ -57,6 +60,14 @@ class Solved:
                 "source_error": self.judgement.source_error,
                 "brdf_error": None if math.isnan(self.judgement.brdf_error) else self.judgement.brdf_error,
             }
+        if self.calibration is not None:
+            document["calibration"] = {
+                "status": self.calibration.status,
+                "metres": dict(self.calibration.values),
+                "metres_std": dict(self.calibration.std),
+                "elements_x": list(self.calibration.card.elements_x),
+                "y": self.calibration.card.y,
+            }
         return document
 
 
@@ -64,11 +75,9 @@ def solve_directory(
     directory: Path,
     out: Path,
     *,
-    method: Method = "auto",
-    nonnegative: bool = True,
-    step_deg: float | None = None,
-    wall_albedo: float | None = None,
+    calibrated: bool = False,
     progress: Callable[[str], None] | None = None,
+    **options: Unpack[SolveOptions],
 ) -> Solved:
     """Read a capture set, recover pattern and BRDF, and leave solution.json, source.csv, brdf.csv and report.html.
 
@@ -76,25 +85,24 @@ def solve_directory(
     ----------
     directory, out:
         The capture set, and the folder to write to; earlier results there are replaced file by file.
-    method, nonnegative, step_deg, wall_albedo, progress:
+    calibrated:
+        Find the card's offset, distance and width from the captures first (`calibrate`).
+    progress, options:
         As in `solve`.
 
     Raises
     ------
     InputError, UndeterminedError
-        As `read_captures` and `solve`; nothing is written then.
+        As `read_captures`, `calibrate` and `solve`; nothing is written then.
     """
     captures = read_captures(directory)
     truth = read_truth(directory)
-    solution = solve(
-        captures,
-        method=method,
-        nonnegative=nonnegative,
-        step_deg=step_deg,
-        wall_albedo=wall_albedo,
-        progress=progress,
-    )
-    solved = Solved(captures, solution, truth, judge(solution, truth))
+    calibration = None
+    if calibrated:
+        calibration = calibrate(captures, progress=progress)
+        captures = replace(captures, card=calibration.card)
+    solution = solve(captures, progress=progress, **options)
+    solved = Solved(captures, solution, truth, judge(solution, truth), calibration)
     write_solution(out, solved)
     return solved
 
@@ -151,7 +159,8 @@ def write_solution(out: Path, solved: Solved) -> None:
         ],
     )
     # Last, so that its presence says that the rest is complete.
-    write_atomically(out / "solution.json", solution.to_json() + "\n")
+    document = json.dumps(solved.summary(), indent=2, allow_nan=False)
+    write_atomically(out / "solution.json", document + "\n")
 
 
 def verdicts(solved: Solved) -> list[Verdict]:
@@ -226,8 +235,13 @@ def certificates(solved: Solved) -> TableBlock:
         ("misfit / stated noise", _number(s.chi_squared), "1 where model and noise are right"),
         ("residual of the fit", f"{100 * s.residual:.2g} %", "noise alone; it does not certify one bounce"),
         ("expected error of the pattern", f"{100 * s.predicted_error:.2g} %", "from the Cramér-Rao bound"),
-        ("free scales", str(s.components), "1, the global scale (gauge: BRDF peak = 1)"),
+        ("free scales", str(s.components), f"1, the global scale (here {s.gauge})"),
+        *((("rests on", " and ".join(s.priors), "true of wall and card, or the answer is not"),) if s.priors else ()),
     ]
+    if solved.calibration is not None:
+        found = solved.calibration
+        for name, value in found.values.items():
+            rows.append((f"the card's {name}, found", f"{value:.6g} m", f"± {found.std[name]:.1e} m; held fixed above"))
     if s.one_bounce is not None:
         check = s.one_bounce
         rows.append(

@@ -1,0 +1,101 @@
+"""Photon counts made an estimate: knots by the normal likelihood, the answer and its bars by that of Poisson."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from wallmirror.captures import CaptureSet
+from wallmirror.derendering.estimate import Estimate
+from wallmirror.derendering.noisy import NOISY_STEPS, refine, require_patterns
+from wallmirror.derendering.poisson import maximise_poisson, poisson_bound
+from wallmirror.derendering.problem import Problem
+from wallmirror.derendering.subspace import SignalSpace
+
+
+def with_counting_noise(captures: CaptureSet, *, per_radiance: float, background: float) -> CaptureSet:
+    """The captures with variances that counting gives each pixel, its mean over the realisations taken as its rate.
+
+    One variance for all realisations of a pixel keeps the normal fit, which is only the start, cheap. What saturates stays
+    out.
+    """
+    mean = np.maximum(captures.radiance.mean(axis=2, keepdims=True), 0.0)
+    variance = np.broadcast_to((mean * per_radiance + max(background, 1.0)) / per_radiance**2, captures.radiance.shape)
+    if captures.variance is not None:
+        variance = np.where(np.isfinite(captures.variance), variance, np.inf)
+    return replace(captures, variance=np.array(variance), variance_is_floor=False)
+
+
+def solve_counts(
+    problem: Problem,
+    space: SignalSpace,
+    *,
+    per_radiance: float,
+    background: float,
+    nonnegative: bool,
+    steps: tuple[float, ...] = NOISY_STEPS,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Estimate:
+    """Fit the Poisson likelihood of counts on the knots that the normal likelihood of like variance prefers.
+
+    Parameters
+    ----------
+    per_radiance:
+        Counts that a radiance of 1 makes in a pixel.
+    background:
+        Mean counts of a pixel without the card, known.
+
+    Raises
+    ------
+    UndeterminedError
+        When the counts do not determine the pattern.
+    """
+    level = refine(problem, space, steps, nonnegative=nonnegative, tell=tell).level
+    grid, designs = level.grid, level.designs
+    unit = problem.scale * per_radiance  # counts per unit of the normalised data
+    used = problem.inverse_variance > 0 if problem.inverse_variance is not None else np.ones_like(problem.noisy)
+    counts = np.maximum(problem.data * unit + background, 0.0)
+    fit = maximise_poisson(
+        counts,
+        designs,
+        level.fit.coefficients,
+        source=level.fit.source * unit,
+        background=background,
+        used=used,
+        nonnegative=nonnegative,
+    )
+    tell(f"Fisher scoring: {fit.gain:.3g} nats above the normal fit after {fit.iterations} steps")
+    peak_at = grid.peak(fit.coefficients, level.summed.exposure)
+    bound = poisson_bound(
+        designs, fit.coefficients, fit.source, gauge=grid.row(peak_at), background=background, used=used
+    )
+    sigma = math.sqrt(max(1.0, fit.chi_squared))
+    transport = np.stack([t @ fit.coefficients for t in designs], axis=1)
+    source = fit.source / unit
+    require_patterns(problem, transport, source, sigma)
+    warnings = []
+    if not fit.converged:
+        warnings.append("the fit stopped before it converged, so the error bars may be too small")
+    if fit.chi_squared > 1.2:
+        warnings.append(
+            f"the counts scatter {fit.chi_squared:.2f} times as much as counting alone, so the model or the counts per "
+            "radiance do not hold; the error bars were widened to match"
+        )
+    return Estimate(
+        method="poisson",
+        grid=grid,
+        closed=level.closed,
+        coefficients=fit.coefficients,
+        source=source,
+        transport=transport,
+        peak_at=peak_at,
+        source_std=sigma * bound.source_std / unit,
+        shape_std=sigma * bound.shape_std / unit,
+        brdf_std=lambda u: sigma * bound.brdf_std(grid, u),
+        predicted_error=sigma * bound.source_error,
+        chi_squared=fit.chi_squared,
+        warnings=tuple(warnings),
+    )
