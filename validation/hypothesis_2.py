@@ -189,7 +189,7 @@ def page(cells: dict[tuple[str, str], Bounces], prices: list[Price], settings: d
     def named(names: list[str]) -> str:
         return ", ".join(f"`{n}`" for n in names) or "none"
 
-    kept = f"it fails in {named(beyond)}" if beyond else "it is kept wherever there is a bound"
+    kept = f"it fails in {named(beyond)}" if beyond else "it is kept everywhere"
     verdicts = "\n".join(
         f"- within {100 * t:g} %: holds in {len(holds[t])} ({named(holds[t])}), fails in {len(fails[t])}"
         + (
@@ -242,8 +242,8 @@ A mirror's pattern is not sought blindly but read off by least squares ("known")
 {price_table(prices)}
 
 - The check was to foretell the bias within a factor of 2. It does in {len(met)} of the {len(met) + len(missed)} scenes whose
-  bias stands out of the noise; not in {named(missed)}. The ratios lie between {min(ratios):.2f} and {max(ratios):.2f};
-  above 1 the check errs on the side of warning.
+  bias stands out of the noise{f" (not in {named(missed)})" if missed else ""}. The ratios lie between {min(ratios):.2f} and
+  {max(ratios):.2f}; above 1 the check errs on the side of warning.
 - The dearest case is `{dearest_scene}`: the bias is {dearest.bias / dearest.predicted_error:.1f} times the solver's own error
   bars, at a misfit of {dearest.chi_squared:.2f} times the noise.
 - A misfit below 1.2 times the noise raises no doubt: {named(quiet)}.
