@@ -87,15 +87,30 @@ class Scene:
                 f"is {self.wall.half_width:g} m, but the views reach {reach:.4g} m; widen the wall or narrow the scan",
                 field="wall.half_width",
             )
-        if self.room is not None and not (
-            self.card.distance < self.room.depth and self.observer.distance < self.room.depth
-        ):
-            raise InputError("the room must be deeper than card and observer are far", field="room.depth")
+        if self.room is not None:
+            _require_inside(self.room, self.card, self.observer)
 
     @property
     def is_one_bounce(self) -> bool:
         """Whether nothing but the wall reflects light, so that Hypothesis 2 holds exactly."""
         return self.room is None and self.card.albedo == 0
+
+
+def _require_inside(room: Room, card: Card, observer: Observer) -> None:
+    """Refuse a room whose walls would stand between wall, card and observer."""
+    if not (card.distance < room.depth and observer.distance < room.depth):
+        raise InputError("the room must be deeper than card and observer are far", field="room.depth")
+    half_card = 0.5 * max(card.board_width, max(card.elements_x) - min(card.elements_x) + card.element_width)
+    reach = max(abs(observer.position[0]), abs(card.middle) + half_card)
+    if reach >= room.half_width:
+        raise InputError(
+            f"is {room.half_width:g} m, but card or observer stand {reach:.4g} m from the middle; widen the room",
+            field="room.half_width",
+        )
+    if 0.5 * max(card.board_height, card.element_height) >= room.half_height:
+        raise InputError(
+            f"is {room.half_height:g} m, less than half of the card's height; raise the room", field="room.half_height"
+        )
 
 
 def scene_names() -> tuple[str, ...]:

@@ -134,3 +134,20 @@ def test_without_llvm_the_demo_goes_on_with_a_smaller_job(tmp_path):
     assert "karellen-llvm-core" in done.stderr or "LLVM" in done.stderr
     assert done.returncode == (0 if document["passed"] else 1)
     assert (tmp_path / "demo" / "report.html").exists()
+
+
+def test_scenes_that_one_bounce_cannot_tell_apart_are_rendered_once(mi, monkeypatch, tmp_path):
+    calls = []
+    original = validating.validate_scene
+    monkeypatch.setattr(
+        validating, "validate_scene", lambda scene, **k: calls.append(scene.name) or original(scene, **k)
+    )
+    scenes = [small(name) for name in ("flat_wall_diffuse", "bounces_diffuse_card_far", "bounces_diffuse_box")]
+    results = validate_scenes(scenes, tmp_path, views=1, spp=16)
+    assert calls == ["flat_wall_diffuse", "bounces_diffuse_box"]  # a box is met, a white card is not
+    assert [r.same_as for r in results] == ["", "flat_wall_diffuse", ""]
+    stored = json.loads((tmp_path / "results.json").read_text())
+    assert [s["same_as"] for s in stored] == [None, "flat_wall_diffuse", None]
+    # What is reused is what a render of its own would give, to the bit.
+    own = original(scenes[1], views=1, spp=16)
+    np.testing.assert_array_equal(own.mean, results[1].mean)

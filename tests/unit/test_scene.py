@@ -228,6 +228,18 @@ FAULTS = {
     "level that overflows": (PATTERNS, "patterns = [[1e200, 1.0]]\nlevel = 1e200", "source.patterns", "not finite"),
     "room too shallow for the observer": (PATTERNS, PATTERNS + ROOM.replace("8.0", "5.0"), "room.depth", "deeper"),
     "room too shallow for the card": (PATTERNS, PATTERNS + ROOM.replace("8.0", "0.5"), "room.depth", "deeper"),
+    "room narrower than the card": (
+        PATTERNS,
+        PATTERNS + ROOM.replace("half_width = 6.0", "half_width = 1.0"),
+        "room.half_width",
+        "widen",
+    ),
+    "room lower than the card": (
+        PATTERNS,
+        PATTERNS + ROOM.replace("half_height = 3.0", "half_height = 0.005"),
+        "room.half_height",
+        "raise",
+    ),
     "room all white": (PATTERNS, PATTERNS + ROOM.replace("0.8", "1.0"), "room.albedo", "from 0 to 0.999"),
     "room without a height": (PATTERNS, PATTERNS + ROOM.replace("half_height = 3.0\n", ""), "room.half_height", "miss"),
     "room as list": ("format = 1", "format = 1\nroom = [1]", "room", "give a table [room]"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import pickle
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -49,6 +50,8 @@ class Validation:
         Analytic and path-traced radiance of the views compared, (A, N).
     views:
         Indices of those views.
+    same_as:
+        Name of the scene whose render this is, where two differ in nothing that one bounce meets; else empty.
     """
 
     scene: Scene
@@ -58,6 +61,7 @@ class Validation:
     comparison: Comparison
     spp: int
     seconds: float
+    same_as: str = ""
 
     @property
     def passed(self) -> bool:
@@ -71,6 +75,7 @@ class Validation:
             "views": list(self.views),
             "seeds": SEEDS,
             "spp_per_seed": self.spp,
+            "same_as": self.same_as or None,
             "seconds": self.seconds,
             **self.comparison.summary(),
         }
@@ -262,10 +267,20 @@ def validate_scenes(
     seed: int = 0,
     progress: Advance | None = None,
 ) -> list[Validation]:
-    """Validate several scenes; leaves results.json and report.html in a folder."""
-    results = []
+    """Validate several scenes; leaves results.json and report.html in a folder.
+
+    Scenes that one bounce cannot tell apart (a white card or a black one) are rendered once.
+    """
+    results: list[Validation] = []
+    rendered: dict[bytes, Validation] = {}
     for number, scene in enumerate(scenes):
-        results.append(validate_scene(scene, views=views, spp=spp, seed=seed))
+        met = _met_at_one_bounce(scene)
+        earlier = rendered.get(met)
+        if earlier is None:
+            rendered[met] = validate_scene(scene, views=views, spp=spp, seed=seed)
+            results.append(rendered[met])
+        else:
+            results.append(replace(earlier, scene=scene, seconds=0.0, same_as=earlier.scene.name))
         if progress is not None:
             progress(number + 1, len(scenes))
     write_page(
@@ -278,6 +293,12 @@ def validate_scenes(
     )
     write_atomically(out / "results.json", json.dumps([r.summary() for r in results], indent=2, allow_nan=False) + "\n")
     return results
+
+
+def _met_at_one_bounce(scene: Scene) -> bytes:
+    """All of a scene that paths of one bounce meet: the card's board and albedo are not of it."""
+    card = replace(scene.card, albedo=0.0, board_width=0.0, board_height=0.0)
+    return pickle.dumps((scene.observer, card, scene.wall, scene.room, scene.source.tolist()))
 
 
 def verdict(result: Validation) -> Verdict:
@@ -303,6 +324,7 @@ def section(result: Validation) -> Section:
         (
             scene.about,
             verdict(result),
+            *((f"At one bounce this is {result.same_as}, and its render is shown.",) if result.same_as else ()),
             FigureBlock(
                 scene_plan(scene.observer, scene.card, half_width=scene.wall.half_width, room=scene.room),
                 "The scene from above, to scale.",
