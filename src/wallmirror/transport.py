@@ -15,6 +15,7 @@ applies it to a known BRDF. The weight G is
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -39,6 +40,8 @@ from wallmirror.geometry import (
 #: What stands in front of the BRDF; see the module's text.
 Weights = Literal["thesis", "cosine", "physical"]
 
+_PARTS = 4  # of a pixel or strip, over which the speed of u is measured
+_WEIGHT_SCALE = 0.35  # radians
 _MAX_ORDER = 256
 
 
@@ -108,7 +111,9 @@ def _orders(
     half_pixel = 0.0 if points else pixel_half_width(observer)
     half_strip = 0.0 if points else card.element_width / 2
     pixel_turn, strip_turn = _extent_in_angle(observer, card, half_pixel, half_strip)
-    orders = quadrature_order(pixel_turn / resolution, tolerance), quadrature_order(strip_turn / resolution, tolerance)
+    # The weight in front of the BRDF varies over angles as well, about as a lobe of this width does.
+    scale = 1 / math.hypot(1 / resolution, 1 / _WEIGHT_SCALE)
+    orders = quadrature_order(pixel_turn / scale, tolerance), quadrature_order(strip_turn / scale, tolerance)
     return half_pixel, half_strip, orders
 
 
@@ -283,17 +288,19 @@ def _lobe_average(width: float, offsets: Array) -> Array:
 
 
 def _extent_in_angle(observer: Observer, card: Card, half_pixel: float, half_strip: float) -> tuple[float, float]:
-    """Largest change of u across one pixel and across one strip, in radians."""
-    t = pixel_tangents(observer)
-    ends = wall_points(observer, t[:, None] + half_pixel * np.array([-1.0, 1.0]))[..., None]
+    """What one pixel and one strip would span in u, in radians, if u ran everywhere as fast as where it is fastest.
+
+    A chord from end to end would miss how u bends: under a near card it runs fast in the middle of a wide pixel.
+    """
+    parts = np.linspace(-1.0, 1.0, _PARTS + 1)
+    across = wall_points(observer, pixel_tangents(observer)[:, None] + half_pixel * parts)[..., None]
     strips = np.asarray(card.elements_x)
-    u = outgoing_angles(observer, ends) + incident_angles(strips, card.distance, ends)
-    pixel = float(np.abs(u[:, :, 1] - u[:, :, 0]).max())
+    u = outgoing_angles(observer, across) + incident_angles(strips, card.distance, across)
+    pixel = _PARTS * float(np.abs(np.diff(u, axis=2)).max())
     centre = wall_points(observer)[..., None]
-    strip = incident_angles(strips + half_strip, card.distance, centre) - incident_angles(
-        strips - half_strip, card.distance, centre
-    )
-    return pixel, float(strip.max())
+    ends = [incident_angles(strips + half_strip * part, card.distance, centre) for part in parts]
+    strip = _PARTS * max(float((right - left).max()) for left, right in itertools.pairwise(ends))
+    return pixel, strip
 
 
 def _kernel(
