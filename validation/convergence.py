@@ -32,8 +32,9 @@ from wallmirror import GaussianTrain, load_scene, read_captures, write_captures
 from wallmirror.comparison import SIGNIFICANCE
 from wallmirror.files import write_atomically
 from wallmirror.jobs.validating import SEEDS, SPP, VIEWS, Expectation, expect, judge, render_seeds
-from wallmirror.pathtracing.building import Sampler
-from wallmirror.pathtracing.rendering import Renderer, render_captures, render_one_hot, spread_seeds
+from wallmirror.pathtracing.cameras import Sampler
+from wallmirror.pathtracing.filming import render_captures, render_one_hot
+from wallmirror.pathtracing.rendering import Renderer, spread_seeds
 
 WALLS = ("flat_wall_diffuse", "flat_wall_phong", "flat_wall_lobes")
 SAMPLERS: tuple[Sampler, Sampler] = ("independent", "multijitter")

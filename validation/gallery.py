@@ -31,7 +31,8 @@ from wallmirror.jobs.bouncing import DEEP, SETTINGS, WALLS, Measured, bounces_sc
 from wallmirror.jobs.picturing import WHOLE, RegionBounces, measure_picture_bounces
 from wallmirror.pathtracing.picturing import PictureRenderer
 from wallmirror.pathtracing.rendering import picture
-from wallmirror.picture_scene import PictureScene, load_picture
+from wallmirror.picture_reading import load_picture
+from wallmirror.picture_scene import PictureScene
 
 SCENES = (
     "thesis_spheres",

@@ -23,7 +23,7 @@ from wallmirror.brdf import (
 )
 from wallmirror.errors import InputError
 from wallmirror.geometry import Card, Observer, pixel_tangents, wall_points
-from wallmirror.pathtracing import building
+from wallmirror.pathtracing import building, cameras
 from wallmirror.scene import Room, Scene, Wall, load_scene
 
 #: Float32 carries lengths of up to 20 m and unit vectors through half a dozen operations.
@@ -63,7 +63,7 @@ def numbers(vector: Any) -> np.ndarray:
 def test_pixels_look_where_geometry_says(mi: Any, view: int) -> None:
     """Through the centre of every pixel: x on the wall as `wall_points` has it, growing with the pixel."""
     case = scene()
-    sensor = mi.load_dict(building.sensor_dict(case, view))
+    sensor = mi.load_dict(cameras.sensor_dict(case, view))
     places = (np.arange(16) + 0.5) / 16
     ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(mi.Float(places), 0.5), mi.Point2f(0.5))
     d = np.array(ray.d).reshape(3, -1)
@@ -75,7 +75,7 @@ def test_pixels_look_where_geometry_says(mi: Any, view: int) -> None:
 
 
 def test_pixels_are_square(mi: Any) -> None:
-    sensor = mi.load_dict(building.sensor_dict(scene(), 0))
+    sensor = mi.load_dict(cameras.sensor_dict(scene(), 0))
     ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(0.5, mi.Float([0.0, 1.0])), mi.Point2f(0.5))
     d = np.array(ray.d).reshape(3, -1)
     up = d[2] / np.hypot(d[0], d[1])
@@ -163,7 +163,7 @@ def test_the_wall_as_rendered_keeps_what_can_be_kept() -> None:
     ("distance", "unit"), [(1.0, 1.0), (5.0, 1.0), (1e3, 1.0), (0.75, 0.5), (1.5e-3, 2.0**-10), (3000.0, 2048.0)]
 )
 def test_unit_brings_the_card_away_from_the_ray_epsilon(distance: float, unit: float) -> None:
-    assert building.metres_per_unit(scene(y=-distance)) == unit
+    assert cameras.metres_per_unit(scene(y=-distance)) == unit
 
 
 def test_points_and_wrong_numbers_are_refused(mi: Any) -> None:
@@ -209,5 +209,5 @@ def test_loads_are_reproducible_unoptimised(mi: Any) -> None:
 
 def test_import_leaves_mitsuba_alone() -> None:
     """The LLVM must be chosen before the first import of drjit, so ours may not cause it."""
-    code = "import sys, wallmirror.pathtracing.rendering; sys.exit('mitsuba' in sys.modules or 'drjit' in sys.modules)"
+    code = "import sys, wallmirror.pathtracing.filming; sys.exit('mitsuba' in sys.modules or 'drjit' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

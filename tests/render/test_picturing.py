@@ -11,6 +11,7 @@ import pytest
 from wallmirror.errors import InputError
 from wallmirror.jobs.picturing import WHOLE, measure_picture_bounces
 from wallmirror.pathtracing.picturing import PictureRenderer, lobes_as_rendered
+from wallmirror.picture_reading import load_picture
 from wallmirror.picture_scene import (
     Background,
     Disk,
@@ -25,7 +26,6 @@ from wallmirror.picture_scene import (
     Shape,
     Sphere,
     TiltedMirrors,
-    load_picture,
 )
 
 pytestmark = pytest.mark.usefixtures("mi")

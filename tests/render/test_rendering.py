@@ -19,7 +19,7 @@ from scipy import stats
 from wallmirror.brdf import BRDF, AngleSumTable, Diffuse, GaussianTrain, Mirror, Phong, Sum, Table
 from wallmirror.errors import InputError
 from wallmirror.geometry import Card, Observer
-from wallmirror.pathtracing import building, rendering
+from wallmirror.pathtracing import building, filming, rendering
 from wallmirror.pathtracing.rendering import FILM_ROUNDING, Render, Renderer
 from wallmirror.scene import RenderSettings, Room, Scene, Wall
 from wallmirror.transport import build_kernel, mirror_matrix
@@ -337,7 +337,7 @@ def test_captures_carry_independent_noise() -> None:
     """Every capture agrees with the model, and no two share their noise."""
     case = scene(LOPSIDED, views=(20.0, -25.0))
     done: list[tuple[int, int]] = []
-    captures = rendering.render_captures(case, spp=1024, seed=11, progress=lambda *step: done.append(step))
+    captures = filming.render_captures(case, spp=1024, seed=11, progress=lambda *step: done.append(step))
     assert done == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert captures.radiance.shape == (2, 64, 2)
     assert captures.variance is not None
@@ -351,7 +351,7 @@ def test_captures_carry_independent_noise() -> None:
     # A correlation of n pairs has standard error 1 / sqrt(n); equal seeds would give nearly 1 (same view).
     correlation = np.corrcoef(noise)[np.triu_indices(4, 1)]
     assert np.abs(correlation).max() < 4.5 / math.sqrt(noise.shape[1])
-    again = rendering.render_captures(case, spp=1024, seed=11)
+    again = filming.render_captures(case, spp=1024, seed=11)
     np.testing.assert_array_equal(again.radiance, captures.radiance)
 
 
@@ -359,7 +359,7 @@ def test_one_hot_renders_mix_linearly() -> None:
     """Same random numbers, so a mixture differs from its render by float32 rounding only."""
     case = scene(LOPSIDED, pixels=32, albedo=0.6, board_width=2.4, board_height=1.0)
     settings: dict[str, Any] = {"spp": 128, "max_depth": 8}
-    transport = rendering.render_one_hot(case, seed=4, **settings)
+    transport = filming.render_one_hot(case, seed=4, **settings)
     assert transport.shape == (3, 32, 3)
     renderer = Renderer(case)
     for view, seed in enumerate(rendering.spread_seeds(4, 3)):

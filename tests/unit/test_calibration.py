@@ -12,8 +12,8 @@ from scipy.optimize import approx_fprime
 
 from wallmirror.brdf import AngleSumBRDF
 from wallmirror.captures import CaptureSet
-from wallmirror.derendering import calibration
 from wallmirror.derendering.calibration import Calibration, Parameter, calibrate, moved
+from wallmirror.derendering.calibration_films import Films, Point
 from wallmirror.derendering.problem import prepare
 from wallmirror.derendering.solve import solve
 from wallmirror.errors import UndeterminedError
@@ -125,10 +125,10 @@ def test_the_gradient_is_that_of_the_mismatch() -> None:
     # follow the range of the angle sums, which the gradient does not know: 1e-3 at knots a twelfth of the lobes wide.
     truth = thesis_card()
     problem, _ = prepare(captured(astray(truth, 0.005, 0.01, 0.01), truth))
-    films = calibration._Films.at(problem, 0.0, 0.25, 7, None)
+    films = Films.at(problem, 0.0, 0.25, 7, None)
     g = np.zeros(3)
-    gradient, hessian, _ = calibration._Point.at(films, g).curvature((0, 1, 2), central=True)
-    numeric = approx_fprime(g, lambda at: calibration._Point.at(films, np.asarray(at)).mismatch, 1e-7)
+    gradient, hessian, _ = Point.at(films, g).curvature((0, 1, 2), central=True)
+    numeric = approx_fprime(g, lambda at: Point.at(films, np.asarray(at)).mismatch, 1e-7)
     np.testing.assert_allclose(2 * gradient, numeric, rtol=5e-3, atol=1e-4 * np.max(np.abs(numeric)))
     # Half the Hessian is positive: without r's part (the twin) it would be larger by far in every direction.
     assert np.all(np.linalg.eigvalsh(hessian) > 0)

@@ -15,6 +15,7 @@ from wallmirror.captures import CaptureSet
 from wallmirror.derendering import general
 from wallmirror.derendering.bounds import cramer_rao
 from wallmirror.derendering.general import GeneralSolution, SplineTable, TableGrid, solve_general
+from wallmirror.derendering.general_stack import Stack
 from wallmirror.derendering.likelihood import moments
 from wallmirror.derendering.solve import solve
 from wallmirror.derendering.splines import SplineGrid
@@ -94,7 +95,7 @@ def captured(
 
 def own_table(captures: list[CaptureSet], step_deg: float, degree: int, *, reciprocal: bool = False) -> SplineTable:
     """A reflectance that is one of the solver's own splines, so that its model holds exactly."""
-    grid, _ = general._Stack.of(captures, reciprocal).designs(step_deg, degree)
+    grid, _ = Stack.of(captures, reciprocal).designs(step_deg, degree)
     middles = [g.start + (np.arange(g.size) + 0.5 * (1 - degree)) * g.step for g in (grid.theta_s, grid.theta_o)]
     cells = Broadening()(middles[0][:, None], middles[1])
     coefficients = np.zeros(grid.size)
@@ -140,8 +141,8 @@ def test_four_positions_suffice_with_reciprocity() -> None:
     assert reciprocal.predicted_error < free.predicted_error
     # Imposed on a wall with a nap, reciprocity is wrong, and the certificate says so.
     combed = captured(4, Combed())
-    assert general._exact(general._Stack.of(combed, True), (8.0,), lambda _: None)[2].mismatch > 1e-5
-    assert general._exact(general._Stack.of(combed, False), (8.0,), lambda _: None)[2].mismatch < 1e-7
+    assert general._exact(Stack.of(combed, True), (8.0,), lambda _: None)[2].mismatch > 1e-5
+    assert general._exact(Stack.of(combed, False), (8.0,), lambda _: None)[2].mismatch < 1e-7
 
 
 @pytest.mark.parametrize(("positions", "reciprocal"), [(16, False), (4, True)])
@@ -167,7 +168,7 @@ def test_rough_specular_reflection() -> None:
 
 
 def test_the_proximal_steps_take_the_ridge_away() -> None:
-    stack = general._Stack.of(captured(8, own_table(captured(8, Broadening()), 8.0, 7)), False)
+    stack = Stack.of(captured(8, own_table(captured(8, Broadening()), 8.0, 7)), False)
     _, designs = stack.designs(8.0, 7)
     rough = stack.closed(designs)
     polished = general._polished(stack, designs, rough)
@@ -202,9 +203,9 @@ def test_noise_costs_no_more_than_the_bound() -> None:
     # the ridge, which costs nothing where cells were seen. The twin, the closed form alone, is far above it.
     truth = own_table(captured(8, Broadening()), 10.0, 3)
     clean = captured(8, truth)
-    stack = general._Stack.of(clean, False)
+    stack = Stack.of(clean, False)
     _, designs = stack.designs(10.0, 3)
-    gauge = general._peak(stack, truth.grid, truth.coefficients)
+    gauge = stack.peak(truth.grid, truth.coefficients)
     films = np.concatenate([c.radiance.reshape(-1, 12) for c in clean])
     summed = moments(films, designs)
     bound = NOISE * math.sqrt(np.mean(films**2))
@@ -216,7 +217,7 @@ def test_noise_costs_no_more_than_the_bound() -> None:
         errors.append(up_to_scale(found.source, patterns()))
         expected = patterns() * float(gauge @ truth.coefficients)
         scores.append((found.source - expected) / found.source_std)
-        noisy = general._Stack.of(captures, False)
+        noisy = Stack.of(captures, False)
         closed.append(up_to_scale(noisy.closed(noisy.designs(10.0, 3)[1]).source, patterns()))
     rms = math.sqrt(np.mean(np.square(errors)))
     assert rms < 1.3 * bound
@@ -275,7 +276,7 @@ def test_the_designs_are_the_transport_of_the_table() -> None:
     # Against the forward model, which knows nothing of splines: T_i r is the transport of the spline's reflectance.
     captures = captured(3, Broadening(), weights="cosine")
     table = own_table(captures, 10.0, 3)
-    _, designs = general._Stack.of(captures, False).designs(10.0, 3)
+    _, designs = Stack.of(captures, False).designs(10.0, 3)
     expected = np.concatenate(
         [build_kernel(c.observer, c.card, weights="cosine").apply(table).reshape(-1, 4) for c in captures]
     )

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from wallmirror.brdf import GaussianTrain
+from wallmirror.picture_reading import load_picture, picture_names
 from wallmirror.picture_scene import (
     Background,
     Glass,
@@ -18,8 +19,6 @@ from wallmirror.picture_scene import (
     Rectangle,
     Sphere,
     TiltedMirrors,
-    load_picture,
-    picture_names,
 )
 from wallmirror.scene import scene_names
 

@@ -14,7 +14,7 @@ import scipy.stats
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from wallmirror.derendering import poisson as module
+from wallmirror.derendering import poisson_information as module
 from wallmirror.derendering.bounds import Bound, cramer_rao
 from wallmirror.derendering.likelihood import maximise, moments
 from wallmirror.derendering.poisson import PoissonFit, maximise_poisson, poisson_bound

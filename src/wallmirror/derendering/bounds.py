@@ -74,8 +74,31 @@ def cramer_rao(data: Moments, coefficients: Array, source: Array, *, gauge: Arra
     gauge:
         c, shape (K,): the values of the basis functions at the peak of rho.
     """
-    seen = data.seen
     schur, inverse, coupled = information(data, coefficients, source)
+    return bound_of(schur, inverse, coupled, seen=data.seen, coefficients=coefficients, source=source, gauge=gauge)
+
+
+def bound_of(
+    schur: Array,
+    inverse: Array,
+    coupled: Array,
+    *,
+    seen: NDArray[np.bool_],
+    coefficients: Array,
+    source: Array,
+    gauge: Array,
+) -> Bound:
+    """The bound that a Fisher information gives, whatever the noise: normal (`cramer_rao`) or of counts (`poisson`).
+
+    Parameters
+    ----------
+    schur, inverse, coupled:
+        S over the seen coefficients (K', K'), H_b^-1 (B, M, M) and H_b^-1 C_b (B, M, K').
+    seen:
+        Which of the K coefficients those are, shape (K,).
+    coefficients, source, gauge:
+        As for `cramer_rao`.
+    """
     c, r = gauge[seen], coefficients[seen]
     strength = float(np.trace(schur)) / max(1, schur.shape[0]) / max(float(c @ c), 1e-300)
     pinned = schur + strength * np.outer(c, c)

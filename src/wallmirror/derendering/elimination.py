@@ -19,7 +19,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from wallmirror.derendering.likelihood import _step_above
+from wallmirror.derendering.convex import minimise_above
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.errors import UndeterminedError
@@ -197,7 +197,7 @@ def climb(system: System, v: Array, r: Array | None, *, nonnegative: bool) -> Po
         while True:
             # V V^T keeps the step off the global scale, which the step after it takes out again.
             damped = normal + level * (damping * np.eye(at.size) + np.outer(at, at))
-            step = _step_above(-at, damped, slope) if nonnegative else np.linalg.solve(damped, slope)
+            step = minimise_above(-at, damped, slope) if nonnegative else np.linalg.solve(damped, slope)
             v = (at + step).reshape(here.v.shape, order="F")
             norm = float(np.linalg.norm(v))
             there = _eliminated(system, v / norm, here.r, nonnegative=nonnegative) if norm > 0 else here
@@ -222,7 +222,7 @@ def _eliminated(system: System, v: Array, likely: Array | None, *, nonnegative: 
     if nonnegative:
         # Pivoting starts from the coefficients that lie above their bound, so it is told which those probably are.
         guess = np.zeros(right.size) if likely is None else np.maximum(likely, 0.0)
-        r = guess + _step_above(-guess, gram, right - gram @ guess)
+        r = guess + minimise_above(-guess, gram, right - gram @ guess)
         free = np.flatnonzero(r > 0)
     if free.size == 0:
         unmoved = system.data.copy()

@@ -1,88 +1,34 @@
 """Maximum likelihood by variable projection: the estimate that noise calls for, and its error bars.
 
 The log-likelihood of D = F(r) V + noise is, up to a constant, -1/2 sum_pb w_pb (D - F V)^2 with w the inverse
-variances. Everything that an iteration needs fits in coefficient space after one pass over the data,
-
-    N_ij = T_i^T W T_j,      X_ib = T_i^T W d_b,
-
-so that an iteration does not touch the pixels. With J_b = sum_i V_ib T_i, H_b = F^T W F, C_b = F^T W J_b the
-Gauss-Newton step eliminates V (variable projection; Golub and Pereyra, SIAM J. Numer. Anal. 10(2), 1973):
+variances. An iteration does not touch the pixels: what it needs of them are their moments N_ij = T_i^T W T_j and
+X_ib = T_i^T W d_b (`moments`). With J_b = sum_i V_ib T_i, H_b = F^T W F, C_b = F^T W J_b the Gauss-Newton step
+eliminates V (variable projection; Golub and Pereyra, SIAM J. Numer. Anal. 10(2), 1973):
 
     S = sum_b J_b^T W J_b - C_b^T H_b^-1 C_b,
     S dr = sum_b J_b^T W e_b - C_b^T H_b^-1 F^T W e_b,      dv_b = H_b^-1 (F^T W e_b - C_b dr).
 
 S is also the Fisher information of r with V eliminated; its null vector is r itself, the global scale.
-Non-negativity turns each step into a convex quadratic programme, solved by block pivoting.
+Non-negativity turns each step into a convex quadratic programme, solved by block pivoting (`convex`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-import scipy.linalg as sl
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from wallmirror.errors import UndeterminedError
+from wallmirror.derendering.convex import minimise_above, solve_positive
+from wallmirror.derendering.moments import Moments, moments
+
+__all__ = ["Fit", "Moments", "best_nonnegative", "information", "maximise", "moments"]
 
 Array = NDArray[np.float64]
 
-# Cells whose Fisher information lies this far below the best-seen cell's are left out of the fit.
-_SEEN = 1e-10
+# Cells seen less than this relative to the best-seen one are weak: noise rules them in a start.
 _WEAK = 1e-4
 _RIDGE = 1e-12
-_PIVOTS = 20
-
-
-@dataclass(frozen=True)
-class Moments:
-    """The data in coefficient space.
-
-    Parameters
-    ----------
-    grams:
-        N_ij for i <= j and each group of realisations that share weights, csr (K, K).
-    group:
-        Group of each realisation, shape (B,).
-    cross:
-        X, shape (B, M, K).
-    energy:
-        sum_p w d^2 of each realisation, shape (B,).
-    observations:
-        Number of data with weight > 0.
-    """
-
-    grams: list[dict[tuple[int, int], sp.csr_array]]
-    group: NDArray[np.intp]
-    cross: Array
-    energy: Array
-    observations: int
-
-    @property
-    def elements(self) -> int:
-        """M."""
-        return int(self.cross.shape[1])
-
-    @property
-    def size(self) -> int:
-        """K."""
-        return int(self.cross.shape[2])
-
-    @cached_property
-    def exposure(self) -> Array:
-        """How well each coefficient is seen, relative to the best-seen one, shape (K,)."""
-        total = np.zeros(self.size)
-        for grams in self.grams:
-            for i in range(self.elements):
-                total += grams[i, i].diagonal()
-        return total / max(float(total.max(initial=0.0)), 1e-300)
-
-    @property
-    def seen(self) -> NDArray[np.bool_]:
-        """Which coefficients the captures see at all, shape (K,)."""
-        return np.asarray(self.exposure > _SEEN)
 
 
 @dataclass(frozen=True)
@@ -117,51 +63,6 @@ class _State:
     normal: Array  # H, (G, M, M)
     pair: Array  # N_ij r, (G, M, M, K)
     objective: float
-
-
-def moments(data: Array, designs: list[sp.csr_array], inverse_variance: Array | None = None) -> Moments:
-    """One pass over the data (P, B): the Gram matrices and cross products that the fit needs.
-
-    Parameters
-    ----------
-    inverse_variance:
-        w, shape (P, B); 0 leaves a pixel out. Left out altogether, all weights are 1.
-    """
-    realisations = data.shape[1]
-    if inverse_variance is None:
-        inverse_variance = np.ones((data.shape[0], 1))
-    weights, group = _alike(inverse_variance)
-    group = np.broadcast_to(group, (realisations,))
-    full = np.broadcast_to(weights, data.shape) if weights.shape[1] == 1 else weights[:, group]
-    weighted = full * data
-    cross = np.stack([(t.T @ weighted).T for t in designs], axis=1)
-    grams = [_grams(designs, weights[:, g]) for g in range(weights.shape[1])]
-    return Moments(
-        grams=grams,
-        group=group,
-        cross=cross,
-        energy=np.sum(weighted * data, axis=0),
-        observations=int(np.count_nonzero(full > 0)),
-    )
-
-
-def _alike(inverse_variance: Array) -> tuple[Array, NDArray[np.intp]]:
-    """The different columns of the weights, and which of them each realisation has."""
-    first = inverse_variance[:, :1]
-    if np.array_equal(np.broadcast_to(first, inverse_variance.shape), inverse_variance):
-        return first, np.zeros(1, dtype=np.intp)
-    weights, group = np.unique(inverse_variance, axis=1, return_inverse=True)
-    return weights, np.asarray(group).ravel().astype(np.intp)
-
-
-def _grams(designs: list[sp.csr_array], weight: Array) -> dict[tuple[int, int], sp.csr_array]:
-    grams = {}
-    for j, right in enumerate(designs):
-        scaled = right.copy()
-        scaled.data = scaled.data * np.repeat(weight, np.diff(scaled.indptr))
-        for i in range(j + 1):
-            grams[i, j] = sp.csr_array(designs[i].T @ scaled)
-    return grams
 
 
 def maximise(
@@ -220,26 +121,11 @@ def best_nonnegative(data: Moments, source: Array) -> Array:
     """The r >= 0 of largest likelihood for a given pattern V >= 0 of shape (M, B): a convex problem, shape (K,)."""
     v = np.maximum(source.T if source.sum() > 0 else -source.T, 0.0)
     cells = np.flatnonzero(data.seen)
-    gram = _gram_of_source(data, v)[np.ix_(cells, cells)]
+    gram = data.gram_of_source(v)[np.ix_(cells, cells)]
     gram[np.diag_indices_from(gram)] += _RIDGE * float(np.trace(gram)) / max(1, cells.size)
     r = np.zeros(data.size)
-    r[cells] = _step_above(np.zeros(cells.size), gram, np.einsum("bi,bik->k", v, data.cross)[cells])
+    r[cells] = minimise_above(np.zeros(cells.size), gram, np.einsum("bi,bik->k", v, data.cross)[cells])
     return r
-
-
-def _gram_of_source(data: Moments, v: Array) -> Array:
-    """sum_b J_b^T W J_b, dense (K, K), for v of shape (B, M)."""
-    total = np.zeros((data.size, data.size))
-    for g, grams in enumerate(data.grams):
-        rows = v[data.group == g]
-        products = rows.T @ rows
-        for (i, j), gram in grams.items():
-            coo = gram.tocoo()
-            row, column = coo.coords
-            total[row, column] += products[i, j] * coo.data
-            if i != j:
-                total[column, row] += products[i, j] * coo.data
-    return total
 
 
 def _clipped(data: Moments, r: Array) -> Array:
@@ -269,7 +155,7 @@ def _evaluate(data: Moments, r: Array, v: Array | None, *, nonnegative: bool) ->
         if nonnegative:
             for b in np.flatnonzero(np.any(v < 0, axis=1)):
                 quadratic_b = normal[data.group[b]] + ridge[data.group[b]]
-                v[b] = _step_above(np.zeros(m), quadratic_b, moment[b])
+                v[b] = minimise_above(np.zeros(m), quadratic_b, moment[b])
     quadratic = np.einsum("bi,bij,bj->b", v, normal[data.group], v)
     objective = float(np.sum(data.energy - 2 * np.sum(v * moment, axis=1) + quadratic))
     return _State(r, v, normal, pair, objective)
@@ -294,7 +180,7 @@ def _step(data: Moments, state: _State, seen: NDArray[np.bool_], *, nonnegative:
         # The gauge r r^T keeps the step off the scale's null direction; the ridge is for barely seen cells.
         schur += level * np.outer(r, r) / max(float(r @ r), 1e-300)
         schur[np.diag_indices_from(schur)] += _RIDGE * level
-        step = _step_above(-r, schur, right) if nonnegative else _solve_positive(schur, right)
+        step = minimise_above(-r, schur, right) if nonnegative else solve_positive(schur, right)
     dr = np.zeros_like(state.r)
     dr[cells] = step
     return dr, float(grad_r @ dr)
@@ -312,52 +198,12 @@ def _modelled(data: Moments, state: _State) -> Array:
     return total
 
 
-def _step_above(floor: Array, quadratic: Array, linear: Array) -> Array:
-    """Minimise 1/2 d Q d - q d over d >= floor by block principal pivoting (Judice and Pires 1994).
-
-    All variables on the wrong side of their bound change sides at once, starting from those that lie at their bound
-    now. Should that cycle, the best vector so far, moved into the bounds, is still a direction to search along.
-    """
-    offset = linear - quadratic @ floor  # in x = d - floor >= 0
-    free = (floor < 0) | (linear > 0)
-    best, fewest = np.zeros_like(floor), floor.size + 1
-    slack = 1e-9 * float(np.max(np.abs(offset), initial=0.0))
-    for _ in range(_PIVOTS):
-        x = np.zeros_like(floor)
-        inside = np.flatnonzero(free)
-        if inside.size:
-            x[inside] = _solve_positive(quadratic[np.ix_(inside, inside)], offset[inside])
-        wrong = np.where(free, x < -1e-12 * np.max(np.abs(x)), quadratic @ x - offset < -slack)
-        count = int(np.count_nonzero(wrong))
-        if count < fewest:
-            best, fewest = x, count
-        if count == 0:
-            break
-        free = free ^ wrong
-    return np.maximum(best, 0.0) + floor
-
-
-def _solve_positive(matrix: Array, right: Array) -> Array:
-    """Cholesky, several times faster than `scipy.linalg.solve`, which also estimates the condition.
-
-    A matrix that rounding has robbed of its smallest eigenvalues gets a larger ridge.
-    """
-    for ridge in (0.0, 1e-11, 1e-9, 1e-7):
-        try:
-            raised = matrix + ridge * np.mean(np.diag(matrix)) * np.eye(matrix.shape[0]) if ridge else matrix
-            factor = sl.cho_factor(raised, lower=True, check_finite=False)
-            return np.asarray(sl.cho_solve(factor, right, check_finite=False), dtype=np.float64)
-        except np.linalg.LinAlgError:
-            continue
-    raise UndeterminedError("the captures leave the pattern undetermined; capture more light, views or patterns")
-
-
 def _schur(
     data: Moments, state: _State, free: NDArray[np.bool_], cells: NDArray[np.intp]
 ) -> tuple[Array, Array, Array]:
     """S on the given cells, and H_b^-1, H_b^-1 C_b with the rows of fixed source entries zero."""
     m = data.elements
-    total = _gram_of_source(data, state.v)
+    total = data.gram_of_source(state.v)
     normal = state.normal[data.group].copy()
     both = free[:, :, None] & free[:, None, :]
     normal = np.where(both, normal, np.eye(m) * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-300)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from wallmirror.derendering.bounds import Bound, cramer_rao
 from wallmirror.derendering.estimate import Estimate, scale_free_error
 from wallmirror.derendering.likelihood import Fit, Moments, best_nonnegative, maximise, moments
-from wallmirror.derendering.problem import Problem, too_few_patterns
+from wallmirror.derendering.problem import Problem, expected_mismatch, too_few_patterns
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form, noise_edge
 from wallmirror.errors import UndeterminedError
@@ -29,6 +29,10 @@ NOISY_STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
 _DEGREE = 3
 # A misfit in units of the noise up to which finer knots are tried out before they are taken.
 _NEARLY_THERE = 3.0
+# A mismatch in units of what noise makes of it, beyond which knots are too coarse to be fitted; and the share of it below
+# which the gap says that they are too fine.
+_FAR_OFF = 2.0
+_GAP = 1.0
 # The pattern may move by this many of its error bars when the knots are halved.
 _STEADY = 3.0
 
@@ -162,7 +166,7 @@ def _halve(
     levels: list[Level] = []
     rival: Fit | None = None
     idle = 0
-    for step in steps:
+    for step in steps[_first_worth_a_fit(problem, space, steps) :]:
         best = levels[-1] if levels else None
         grid, designs = problem.designs(step, degree=_DEGREE, tolerance=1e-5)
         summed = moments(problem.data, designs, problem.inverse_variance)
@@ -194,6 +198,25 @@ def _halve(
         levels.append(Level(grid, designs, summed, closed, fit))
         rival, idle = None, 0
     return levels, rival
+
+
+def _first_worth_a_fit(problem: Problem, space: SignalSpace, steps: tuple[float, ...]) -> int:
+    """Index of the first knots whose closed form misses the data's space by about what noise makes it miss.
+
+    Coarser ones are far from explaining the films, and a fit on them would only be a start for the next. Where none
+    comes near, or the noise is not known, the search begins with the coarsest.
+    """
+    if space.rank < problem.card.elements:
+        return 0
+    for index, step in enumerate(steps):
+        _, designs = problem.designs(step, degree=_DEGREE, tolerance=1e-4)
+        closed = closed_form(problem.weighted_data, problem.weighted(designs), space)
+        expected = expected_mismatch(problem, space, closed)
+        if not closed.mismatch > _FAR_OFF * expected:
+            return 0 if math.isnan(expected) else index
+        if closed.gap < _GAP * closed.mismatch:
+            break
+    return 0
 
 
 def _pays(problem: Problem, best: Level, fit: Fit, summed: Moments) -> bool:

@@ -6,10 +6,8 @@ sum D log m - m. Its expected curvature is that of weighted least squares with w
 
     S dr = sum_b J_b^T s_b - C_b^T H_b^-1 F^T s_b,          dv_b = H_b^-1 (F^T s_b - C_b dr),
 
-where J_b = sum_i V_ib T_i, H_b = F^T W_b F, C_b = F^T W_b J_b and S = sum_b J_b^T W_b J_b - C_b^T H_b^-1 C_b. The weights
-differ from entry to entry and from step to step, but the largest sum needs none of the B products of its own:
-
-    sum_b J_b^T W_b J_b = sum_ij T_i^T diag(q_ij) T_j,          q_ij[p] = sum_b w_pb V_ib V_jb.
+where J_b = sum_i V_ib T_i, H_b = F^T W_b F, C_b = F^T W_b J_b and S = sum_b J_b^T W_b J_b - C_b^T H_b^-1 C_b.
+(`poisson_information`).
 """
 
 from __future__ import annotations
@@ -17,25 +15,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg as sl
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from wallmirror.derendering.bounds import Bound, _scale_free_error, _shape_std
-from wallmirror.derendering.likelihood import _solve_positive, _step_above
+from wallmirror.derendering.bounds import Bound, bound_of
+from wallmirror.derendering.convex import minimise_above, solve_positive
+from wallmirror.derendering.poisson_information import Products, information_of_counts, seen_cells, transport_of
 from wallmirror.errors import InputError
 
 Array = NDArray[np.float64]
 
 _RIDGE = 1e-12
-# Cells whose Fisher information lies this far below the best-seen cell's are left out.
-_SEEN = 1e-10
 # Where the mean is this far below the largest the bound counts no more information than there.
 _DARK = 1e-6
 # A start must give every count a chance: r and V are raised to this share of their largest entry.
 _START_FLOOR = 1e-6
-# Products of T's entries that are worth keeping: 200 MB of them.
-_MOST_PRODUCTS = 12_000_000
 
 
 @dataclass(frozen=True)
@@ -74,7 +68,7 @@ class _Counts:
     designs: list[sp.csr_array]
 
     def mean(self, r: Array, v: Array) -> Array:
-        return _transport(self.designs, r) @ v + self.background
+        return transport_of(self.designs, r) @ v + self.background
 
     def score(self, mean: Array, least: float) -> Array:
         """Slope of the log-likelihood in the mean."""
@@ -138,7 +132,7 @@ def maximise_poisson(
     if not least_mean > 0:
         raise InputError(f"is {least_mean:g}; give a small number of counts above zero", field="least_mean")
     data = _checked(counts, designs, background, used)
-    seen = _seen(designs)
+    seen = seen_cells(designs)
     r = np.where(seen, start, 0.0)
     v = np.asarray(_least_squares(data, r) if source is None else source, dtype=np.float64)
     if nonnegative:
@@ -146,7 +140,7 @@ def maximise_poisson(
         r = np.where(seen, np.maximum(r, _START_FLOOR * float(np.max(r))), 0.0)
         v = np.maximum(v, _START_FLOOR * float(np.max(v)))
     mean = data.mean(r, v)
-    products = _Products(designs)
+    products = Products(designs)
     total = 0.0
     for iteration in range(1, max_iterations + 1):
         dr, dv, slope = _scoring_step(data, products, r, v, mean, seen, least_mean, nonnegative=nonnegative)
@@ -193,39 +187,14 @@ def poisson_bound(
     """
     shape = (designs[0].shape[0], source.shape[1])
     data = _checked(np.zeros(shape), designs, background, used)
-    seen = _seen(designs)
-    cells = np.flatnonzero(seen)
+    seen = seen_cells(designs)
     mean = data.mean(coefficients, source)
     weights = data.weights(mean, _DARK * float(mean.max()))
     free = np.ones(source.shape, dtype=bool)
-    schur, inverse, coupled = _information(_Products(designs), coefficients, source, weights, cells, free)
-    c, r = gauge[seen], coefficients[seen]
-    level = float(np.trace(schur)) / max(1, cells.size)
-    strength = level / max(float(c @ c), 1e-300)
-    pinned = schur + strength * np.outer(c, c)
-    # Barely seen cells keep a finite variance by a ridge, which rounding in S, times the condition of H, sets.
-    lost = max(_RIDGE, 4 * np.finfo(np.float64).eps * float(np.max(np.linalg.cond(inverse))))
-
-    def invert(ridge: float) -> Array:
-        identity = np.eye(cells.size)
-        factor = sl.cho_factor(pinned + ridge * identity, lower=True, check_finite=False)
-        covariance = sl.cho_solve(factor, identity, check_finite=False)
-        covariance -= np.outer(r, r) / (strength * float(c @ r) ** 2)
-        return np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)
-
-    covariance = invert(lost * level)
-    error = _scale_free_error(source, inverse, coupled, covariance)
-    # What the ridge alone holds, nothing holds.
-    if lost > 1e-3 or _scale_free_error(source, inverse, coupled, invert(10 * lost * level)) < 0.8 * error:
-        error = float("inf")
-    variance = np.einsum("bii->bi", inverse) + np.einsum("bik,kl,bil->bi", coupled, covariance, coupled, optimize=True)
-    return Bound(
-        coefficients=covariance,
-        seen=seen,
-        source_std=np.sqrt(np.maximum(variance, 0.0)).T,
-        shape_std=_shape_std(source, inverse, coupled, covariance, variance),
-        source_error=error,
+    schur, inverse, coupled = information_of_counts(
+        Products(designs), coefficients, source, weights, np.flatnonzero(seen), free
     )
+    return bound_of(schur, inverse, coupled, seen=seen, coefficients=coefficients, source=source, gauge=gauge)
 
 
 def _checked(
@@ -242,21 +211,10 @@ def _checked(
 
 def _least_squares(data: _Counts, r: Array) -> Array:
     """V for a given r with equal weights, shape (M, B)."""
-    transport = _transport(data.designs, r)
+    transport = transport_of(data.designs, r)
     light = data.counts - data.background
     columns = zip(light.T, data.used.T)
     return np.stack([np.linalg.lstsq(transport[used], column[used])[0] for column, used in columns], axis=1)
-
-
-def _seen(designs: list[sp.csr_array]) -> NDArray[np.bool_]:
-    energy = np.zeros(designs[0].shape[1])
-    for t in designs:
-        energy += np.bincount(t.indices, weights=t.data**2, minlength=energy.size)
-    return np.asarray(energy > _SEEN * energy.max())
-
-
-def _transport(designs: list[sp.csr_array], r: Array) -> Array:
-    return np.stack([t @ r for t in designs], axis=1)
 
 
 def _fit(
@@ -269,7 +227,7 @@ def _fit(
 
 def _scoring_step(
     data: _Counts,
-    products: _Products,
+    products: Products,
     r: Array,
     v: Array,
     mean: Array,
@@ -280,13 +238,13 @@ def _scoring_step(
 ) -> tuple[Array, Array, float]:
     """The step in r and V, and the gain of log-likelihood that its slope promises."""
     score = data.score(mean, least)
-    transport = _transport(data.designs, r)
+    transport = transport_of(data.designs, r)
     grad_r = np.sum([t.T @ (score @ v[i]) for i, t in enumerate(data.designs)], axis=0)
     grad_v = transport.T @ score  # (M, B)
     free = (v > 0) | (grad_v > 0) if nonnegative else np.ones(v.shape, dtype=bool)
     grad_v = np.where(free, grad_v, 0.0)
     cells = np.flatnonzero(seen)
-    schur, inverse, coupled = _information(products, r, v, data.weights(mean, least), cells, free)
+    schur, inverse, coupled = information_of_counts(products, r, v, data.weights(mean, least), cells, free)
     right = grad_r[cells] - np.einsum("bmk,mb->k", coupled, grad_v)
     level = float(np.trace(schur)) / max(1, cells.size)
     here = r[cells]
@@ -294,84 +252,8 @@ def _scoring_step(
     schur += level * np.outer(here, here) / max(float(here @ here), 1e-300)
     schur[np.diag_indices_from(schur)] += _RIDGE * level
     dr = np.zeros_like(r)
-    dr[cells] = _step_above(-here, schur, right) if nonnegative else _solve_positive(schur, right)
+    dr[cells] = minimise_above(-here, schur, right) if nonnegative else solve_positive(schur, right)
     dv = np.einsum("bij,jb->ib", inverse, grad_v) - np.einsum("bik,k->ib", coupled, dr[cells])
     if nonnegative:
         dv = np.maximum(dv, -v)
     return dr, dv, float(grad_r @ dr + np.sum(grad_v * dv))
-
-
-def _information(
-    products: _Products,
-    r: Array,
-    v: Array,
-    weights: Array,
-    cells: NDArray[np.intp],
-    free: NDArray[np.bool_],
-) -> tuple[Array, Array, Array]:
-    """S over the given cells, H_b^-1 (B, M, M) and H_b^-1 C_b (B, M, K'), rows of fixed source entries zero."""
-    m, realisations = v.shape
-    total = products.summed(weights, v)
-    transport = _transport(products.designs, r)
-    normal = np.empty((realisations, m, m))
-    coupling = np.zeros((realisations, m, r.size))
-    for i in range(m):
-        seen_from = weights * transport[:, i : i + 1]  # (P, B)
-        normal[:, i] = seen_from.T @ transport
-        for j, t in enumerate(products.designs):
-            coupling[:, i] += (t.T @ (seen_from * v[j])).T
-    both = free.T[:, :, None] & free.T[:, None, :]
-    trace = np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-300
-    normal = np.where(both, normal, np.eye(m) * trace)
-    inverse = np.where(both, np.linalg.inv(normal + 1e-14 * trace * np.eye(m)), 0.0)
-    coupling = coupling[:, :, cells]
-    coupled = inverse @ coupling
-    schur = total[np.ix_(cells, cells)]
-    schur -= coupling.reshape(-1, cells.size).T @ coupled.reshape(-1, cells.size)
-    return 0.5 * (schur + schur.T), inverse, coupled
-
-
-class _Products:
-    """sum_ij T_i^T diag(q_ij) T_j for any weights, from products of T's entries that are formed once where they fit."""
-
-    def __init__(self, designs: list[sp.csr_array]) -> None:
-        self.designs = designs
-        self.pairs = [(i, j) for j in range(len(designs)) for i in range(j + 1)]
-        rows, size = designs[0].shape
-        widths = [int(np.diff(t.indptr).max(initial=1)) for t in designs]
-        self.kept: list[tuple[NDArray[np.intp], Array]] | None = None
-        if rows * sum(widths[i] * widths[j] for i, j in self.pairs) <= _MOST_PRODUCTS:
-            padded = [_padded(t, w) for t, w in zip(designs, widths)]
-            self.kept = [
-                (
-                    (padded[i][0][:, :, None] * size + padded[j][0][:, None, :]).reshape(rows, -1),
-                    (padded[i][1][:, :, None] * padded[j][1][:, None, :]).reshape(rows, -1),
-                )
-                for i, j in self.pairs
-            ]
-
-    def summed(self, weights: Array, v: Array) -> Array:
-        """sum_b J_b^T W_b J_b, dense (K, K), for weights (P, B) and a pattern (M, B)."""
-        size = self.designs[0].shape[1]
-        upper, diagonal = np.zeros(size * size), np.zeros(size * size)
-        for n, (i, j) in enumerate(self.pairs):
-            q = weights @ (v[i] * v[j])
-            target = diagonal if i == j else upper
-            if self.kept is not None:
-                where, values = self.kept[n]
-                target += np.bincount(where.ravel(), weights=(values * q[:, None]).ravel(), minlength=size * size)
-            else:
-                scaled = self.designs[j].copy()
-                scaled.data = scaled.data * np.repeat(q, np.diff(scaled.indptr))
-                target += sp.csr_array(self.designs[i].T @ scaled).toarray().ravel()
-        upper = upper.reshape(size, size)
-        return np.asarray(diagonal.reshape(size, size) + upper + upper.T)
-
-
-def _padded(design: sp.csr_array, width: int) -> tuple[NDArray[np.intp], Array]:
-    """Columns and values of each row, filled up with zeros in column 0; both (P, width)."""
-    lengths = np.diff(design.indptr)
-    inside = np.arange(width) < lengths[:, None]
-    columns, values = np.zeros(inside.shape, dtype=np.intp), np.zeros(inside.shape)
-    columns[inside], values[inside] = design.indices, design.data
-    return columns, values

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
-from wallmirror.derendering.subspace import SignalSpace, noise_edge, signal_space, space_within
+from wallmirror.derendering.subspace import ClosedForm, SignalSpace, noise_edge, signal_space, space_within
 from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card
 from wallmirror.transport import build_kernel
@@ -190,3 +190,20 @@ def _signal_space(problem: Problem, *, weak_patterns: bool) -> SignalSpace:
     if certain or not weak_patterns:
         raise too_few_patterns(space.rank, elements)
     return space
+
+
+def expected_mismatch(problem: Problem, space: SignalSpace, closed: ClosedForm) -> float:
+    """1 - lambda_1 that noise alone makes in P dimensions: s^2 (P - M) |V^+|^2 / |F|^2, from first-order perturbation of U.
+
+    s^2 is 1 where the rows are whitened by stated variances, else the mean square of the singular values beyond M.
+    """
+    dimensions, realisations = space.dimensions, problem.data.shape[1]
+    elements = problem.card.elements
+    if problem.noise_is_stated:
+        noise = 1.0
+    elif realisations > elements:
+        noise = float(np.sum(space.singular_values[elements:] ** 2)) / (dimensions * (realisations - elements))
+    else:
+        return math.nan
+    inverse = np.linalg.pinv(closed.source)
+    return float(noise * (dimensions - elements) * np.sum(inverse**2) / np.sum(closed.transport**2))

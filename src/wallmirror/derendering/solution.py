@@ -15,8 +15,8 @@ from wallmirror.brdf import AngleSumTable
 from wallmirror.derendering.components import components
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.one_bounce import OneBounceCheck
-from wallmirror.derendering.problem import Problem
-from wallmirror.derendering.subspace import ClosedForm, SignalSpace
+from wallmirror.derendering.problem import Problem, expected_mismatch
+from wallmirror.derendering.subspace import SignalSpace
 from wallmirror.errors import InputError, UndeterminedError
 from wallmirror.interreflection import directional_albedo
 
@@ -293,23 +293,6 @@ def conclude(
         one_bounce=one_bounce,
         seconds=seconds(),
     )
-
-
-def expected_mismatch(problem: Problem, space: SignalSpace, closed: ClosedForm) -> float:
-    """1 - lambda_1 that noise alone makes in P dimensions: s^2 (P - M) |V^+|^2 / |F|^2, from first-order perturbation of U.
-
-    s^2 is 1 where the rows are whitened by stated variances, else the mean square of the singular values beyond M.
-    """
-    dimensions, realisations = space.dimensions, problem.data.shape[1]
-    elements = problem.card.elements
-    if problem.noise_is_stated:
-        noise = 1.0
-    elif realisations > elements:
-        noise = float(np.sum(space.singular_values[elements:] ** 2)) / (dimensions * (realisations - elements))
-    else:
-        return math.nan
-    inverse = np.linalg.pinv(closed.source)
-    return float(noise * (dimensions - elements) * np.sum(inverse**2) / np.sum(closed.transport**2))
 
 
 def _status(problem: Problem, estimate: Estimate, warnings: list[str]) -> str:

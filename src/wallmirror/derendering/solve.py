@@ -18,9 +18,9 @@ from wallmirror.derendering.counting import solve_counts, with_counting_noise
 from wallmirror.derendering.exact import EXACT_STEPS, solve_exactly
 from wallmirror.derendering.noisy import NOISY_STEPS, solve_noisy
 from wallmirror.derendering.one_bounce import check_one_bounce
-from wallmirror.derendering.problem import Problem, prepare
+from wallmirror.derendering.problem import Problem, expected_mismatch, prepare
 from wallmirror.derendering.scarce import solve_scarce
-from wallmirror.derendering.solution import Gauge, Scale, Solution, conclude, expected_mismatch
+from wallmirror.derendering.solution import Gauge, Scale, Solution, conclude
 from wallmirror.derendering.subspace import SignalSpace
 from wallmirror.errors import InputError
 

@@ -200,11 +200,12 @@ def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) ->
 def banded_gram(designs: list[sp.csr_array]) -> Array:
     """Lower band of A = sum_i T_i^T T_i, shape (w, K): entry [d, k] is A[k + d, k].
 
-    The rows of a design matrix are runs of equal length, so that the band sums up without a sparse product.
+    Rows that are runs of neighbouring columns, of equal length within each T_i, as `design_matrices` makes them, sum up
+    without a sparse product.
     """
     size = designs[0].shape[1]
-    widths = [t.nnz // t.shape[0] for t in designs]
-    if any(np.any(np.diff(t.indptr) != w) or w == 0 for t, w in zip(designs, widths, strict=True)):
+    widths = [_run_length(t) for t in designs]
+    if 0 in widths:
         return _band_of(sp.csr_array(sum(t.T @ t for t in designs)))
     band = np.zeros((max(widths), size))
     for t, width in zip(designs, widths, strict=True):
@@ -214,6 +215,16 @@ def banded_gram(designs: list[sp.csr_array]) -> Array:
             columns = first[:, None] + np.arange(width - d)
             band[d] += np.bincount(columns.ravel(), weights=products.ravel(), minlength=size)
     return band
+
+
+def _run_length(design: sp.csr_array) -> int:
+    """Number of columns in each row where all rows are runs of neighbouring columns of equal length, and 0 elsewhere."""
+    width = int(design.nnz // design.shape[0])
+    if width == 0 or np.any(np.diff(design.indptr) != width):
+        return 0
+    # First and last column alone would pass for a run where columns stand out of order.
+    columns = design.indices.reshape(-1, width)
+    return width if np.array_equal(columns, columns[:, :1] + np.arange(width, dtype=columns.dtype)) else 0
 
 
 def _band_of(gram: sp.csr_array) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 from wallmirror.brdf import Mirror
 from wallmirror.captures import CaptureSet, Truth, write_captures
 from wallmirror.console import Advance
-from wallmirror.pathtracing.rendering import render_captures
+from wallmirror.pathtracing.filming import render_captures
 from wallmirror.scene import Scene
 
 _TRUTH_NODES = 7201

@@ -23,7 +23,8 @@ from wallmirror.interreflection import directional_albedo, glow_in_mirror
 from wallmirror.jobs.bouncing import DEEP, RR_DEPTH, json_of, spread
 from wallmirror.jobs.capturing import truth_of
 from wallmirror.jobs.solving import judge
-from wallmirror.pathtracing.rendering import render_captures, spread_seeds
+from wallmirror.pathtracing.filming import render_captures
+from wallmirror.pathtracing.rendering import spread_seeds
 from wallmirror.scene import Scene
 from wallmirror.transport import mirror_matrix
 

@@ -1,4 +1,4 @@
-"""From a Scene to Mitsuba: wall, card, room, cameras and integrator as the dictionaries that `mi.load_dict` takes.
+"""From a Scene to Mitsuba: wall, card, room and integrator as the dictionaries that `mi.load_dict` takes.
 
 Every function that returns a dictionary needs a variant to be set (`runtime.activate`), because transforms belong to
 one. Load with `mi.load_dict(..., optimize=False)`: the optimisation merges equal materials in an order that changes
@@ -7,7 +7,7 @@ from load to load, and with it the emitters' order and every sample drawn from t
 What the path tracer sees differs from the Scene in three ways:
 
 - BRDFs of the angle sum are tables of float32 (`wall_as_rendered` gives what is really there);
-- lengths are in units of `metres_per_unit`, 1 for scenes of ordinary size: Mitsuba starts rays about
+- lengths are in units of `cameras.metres_per_unit`, 1 for scenes of ordinary size: Mitsuba starts rays about
   9e-5 (1 + |p|) beside the point p that they leave, which a card closer than one unit would notice;
 - the camera looks through the card, which is an emitter, strips and board, so that `hide_emitters` hides it; what it
   sees through a board is displaced sideways by that same 9e-5 (1 + |p|), a hundredth of a pixel in our scenes.
@@ -19,7 +19,7 @@ import importlib
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,19 +27,16 @@ from numpy.typing import ArrayLike, NDArray
 from wallmirror.brdf import BRDF, AngleSumBRDF, AngleSumTable, Diffuse, Mirror, Table, tabulate
 from wallmirror.errors import InputError
 from wallmirror.pathtracing import bsdf
+from wallmirror.pathtracing.cameras import Sampler, metres_per_unit, sensor_dict, to_world
 from wallmirror.pathtracing.tables import table_text
 from wallmirror.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: Mitsuba's sample generators that are of use here: independent samples, or stratified ones with far less noise.
-Sampler = Literal["independent", "multijitter"]
-
 _X = (1.0, 0.0, 0.0)
 _Y = (0.0, 1.0, 0.0)
 _Z = (0.0, 0.0, 1.0)
 _BOARD_GAP = 1e-3  # between strips and board, in card distances: far above float32, far below what light would notice
-_PICTURE_FOV = 70.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,15 +90,6 @@ def wall_as_rendered(scene: Scene) -> BRDF:
             return Table(values=_float32(brdf.values))
         case _:
             raise InputError(f"{type(brdf).__name__} cannot be rendered; tabulate it", field="wall.brdf")
-
-
-def metres_per_unit(scene: Scene) -> float:
-    """Length of one Mitsuba unit in metres: 1, or the power of two that brings the card between 1 and 2 units.
-
-    Radiance does not know the unit, and a power of two rounds nothing.
-    """
-    distance = scene.card.distance
-    return 1.0 if 1 <= distance < 1024 else 2.0 ** math.floor(math.log2(distance))
 
 
 def mitsuba_dict(
@@ -166,52 +154,6 @@ def radiance_key(element: int) -> str:
 def integrator_dict(max_depth: int, rr_depth: int, *, hide_emitters: bool = True) -> dict[str, Any]:
     """Mitsuba's path tracer; `max_depth` 2 is one bounce, `rr_depth` is where Russian roulette begins."""
     return {"type": "path", "max_depth": max_depth, "rr_depth": rr_depth, "hide_emitters": hide_emitters}
-
-
-def camera_to_world(scene: Scene, view: int) -> Any:
-    """Mitsuba's camera transform for one view: looking along the view's angle, z up, x growing with the pixel.
-
-    Raises
-    ------
-    InputError
-        For a view that is not there.
-    """
-    observer = scene.observer
-    if not 0 <= view < observer.views:
-        raise InputError(f"{view} is not there; the views are 0 to {observer.views - 1}", field="view")
-    angle = observer.view_angles[view]
-    forward = (-math.sin(angle), math.cos(angle), 0.0)
-    return _camera_transform(forward, (*observer.position, 0.0), metres_per_unit(scene))
-
-
-def sensor_dict(scene: Scene, view: int, *, sampler: Sampler = "independent", spp: int | None = None) -> dict[str, Any]:
-    """The observer's camera for one view: N x 1 square pixels with a box filter, in float32."""
-    observer = scene.observer
-    if observer.pixels_at != "centres":
-        raise InputError('"edges" samples points; a path tracer has pixels, "centres"', field="observer.pixels_at")
-    if sampler not in get_args(Sampler):
-        raise InputError(f'is "{sampler}"; choose one of {", ".join(get_args(Sampler))}', field="sampler")
-    return {
-        **_pinhole(scene, math.degrees(observer.fov), observer.pixels, 1),
-        "to_world": camera_to_world(scene, view),
-        "sampler": {"type": sampler, "sample_count": spp or scene.render.spp},
-    }
-
-
-def picture_sensor_dict(scene: Scene, width: int, height: int) -> dict[str, Any]:
-    """A camera beside and above the observer that shows wall, card and room as a visitor would see them."""
-    reach = max(scene.observer.distance, scene.card.distance)
-    place = np.array([0.35 * reach, -1.5 * reach, 0.25 * reach])
-    if scene.room is not None:
-        half = np.array([scene.room.half_width, scene.room.depth, scene.room.half_height])
-        place = np.clip(place, [0, -0.97, 0] * half, [0.6, 0, 0.6] * half)
-    target = np.array([0.0, -0.5 * scene.card.distance, 0.0])
-    forward = (target - place) / np.linalg.norm(target - place)
-    return {
-        **_pinhole(scene, _PICTURE_FOV, width, height),
-        "to_world": _camera_transform(forward, place, metres_per_unit(scene)),
-        "sampler": {"type": "independent"},
-    }
 
 
 def export_xml(scene: Scene, path: str | Path, *, view: int = 0, realisation: int = 0) -> None:
@@ -338,39 +280,4 @@ def _rectangle(
     matrix[:3, 1] = np.cross(normal, along) * (size[1] / unit)
     matrix[:3, 2] = normal
     matrix[:3, 3] = np.divide(centre, unit)
-    return {"type": "rectangle", "to_world": _transform(matrix)}
-
-
-def _pinhole(scene: Scene, fov_deg: float, width: int, height: int) -> dict[str, Any]:
-    # The clips are absolute lengths, so they must follow the scene; neither costs precision.
-    reach = (scene.observer.distance + scene.card.distance) / metres_per_unit(scene)
-    return {
-        "type": "perspective",
-        "fov": fov_deg,
-        "fov_axis": "x",
-        "near_clip": 1e-3 * reach,
-        "far_clip": 1e5 * reach,
-        "film": {
-            "type": "hdrfilm",
-            "width": width,
-            "height": height,
-            "pixel_format": "luminance",
-            "component_format": "float32",
-            "rfilter": {"type": "box"},
-        },
-    }
-
-
-def _camera_transform(forward: ArrayLike, place: ArrayLike, unit: float) -> Any:
-    """Camera axes: x to the left of the picture, y up, z forward."""
-    forward = np.asarray(forward, dtype=np.float64)
-    left = np.cross(_Z, forward)
-    left /= np.linalg.norm(left)
-    matrix = np.eye(4)
-    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = left, np.cross(forward, left), forward
-    matrix[:3, 3] = np.divide(place, unit)
-    return _transform(matrix)
-
-
-def _transform(matrix: Array) -> Any:
-    return _mitsuba().ScalarTransform4f(matrix.tolist())
+    return {"type": "rectangle", "to_world": to_world(matrix)}

@@ -18,7 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from wallmirror.brdf import AngleSumBRDF, tabulate
 from wallmirror.errors import InputError
 from wallmirror.pathtracing import bsdf
-from wallmirror.pathtracing.building import Sampler, integrator_dict
+from wallmirror.pathtracing.building import integrator_dict
+from wallmirror.pathtracing.cameras import Sampler
 from wallmirror.pathtracing.rendering import spread_seeds
 from wallmirror.pathtracing.runtime import activate
 from wallmirror.picture_scene import (

@@ -1,4 +1,4 @@
-"""Rendering a Scene: one view, all captures, the transport matrix by linearity, a picture for the report.
+"""Rendering a Scene: one view of one pattern with its noise, and a picture for the report.
 
 A `Renderer` loads its scene once and from then on only changes the camera's place and the strips' radiances, which
 compiles nothing anew. Three properties of Mitsuba shape what happens here:
@@ -14,22 +14,20 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wallmirror.captures import CaptureSet
 from wallmirror.errors import InputError
-from wallmirror.pathtracing import building
-from wallmirror.pathtracing.building import Sampler
+from wallmirror.pathtracing import building, cameras
+from wallmirror.pathtracing.cameras import Sampler
 from wallmirror.pathtracing.runtime import activate
 from wallmirror.scene import Scene
 
 Array = NDArray[np.float64]
-Progress = Callable[[int, int], None]
 
 #: Where a variance comes from: the samples' second moment, or the scatter of the seeds.
 VarianceMethod = Literal["moments", "seeds"]
@@ -209,10 +207,10 @@ class Renderer:
     def _aimed(self, view: int, sampler: Sampler) -> Any:
         """The camera with this sampler, turned to the view."""
         if sampler not in self._sensors:
-            sensor = self._mi.load_dict(building.sensor_dict(self.scene, view, sampler=sampler))
+            sensor = self._mi.load_dict(cameras.sensor_dict(self.scene, view, sampler=sampler))
             self._sensors[sampler] = sensor, self._mi.traverse(sensor)
         sensor, parameters = self._sensors[sampler]
-        parameters["to_world"] = building.camera_to_world(self.scene, view)
+        parameters["to_world"] = cameras.camera_to_world(self.scene, view)
         parameters.update()
         return sensor
 
@@ -248,98 +246,6 @@ class Renderer:
         return mean, second
 
 
-def render_captures(
-    scene: Scene,
-    *,
-    spp: int | None = None,
-    seed: int = 0,
-    max_depth: int | None = None,
-    rr_depth: int | None = None,
-    variant: str = "llvm_ad_mono",
-    progress: Progress | None = None,
-) -> CaptureSet:
-    """Render each view of each realisation on its own, with random numbers of its own.
-
-    Parameters
-    ----------
-    spp, max_depth, rr_depth:
-        Samples per pixel of each capture, and the depths; the scene's own where left out.
-    seed:
-        Root of all seeds, any integer >= 0.
-    progress:
-        Called with (captures done, captures in all).
-
-    Returns
-    -------
-    Radiance and variance, both (A, N, B), with the geometry; the variance is that of `Render.moment_variance`.
-    """
-    renderer = Renderer(scene, variant=variant)
-    settings = scene.render
-    spp = settings.spp if spp is None else spp
-    max_depth = settings.max_depth if max_depth is None else max_depth
-    rr_depth = settings.rr_depth if rr_depth is None else rr_depth
-    views, pixels, realisations = scene.observer.views, scene.observer.pixels, scene.source.shape[1]
-    radiance, variance = np.empty((2, views, pixels, realisations))
-    seeds = spread_seeds(seed, views * realisations)
-    for done, pass_seed in enumerate(seeds):
-        view, realisation = divmod(done, realisations)
-        render = renderer.render(
-            view,
-            scene.source[:, realisation],
-            spp=spp,
-            seeds=(pass_seed,),
-            max_depth=max_depth,
-            rr_depth=rr_depth,
-        )
-        radiance[view, :, realisation] = render.mean
-        variance[view, :, realisation] = render.variance
-        if progress is not None:
-            progress(done + 1, len(seeds))
-    runtime = renderer.runtime
-    return CaptureSet(
-        observer=scene.observer,
-        card=scene.card,
-        room=scene.room,
-        radiance=radiance,
-        variance=variance,
-        provenance={
-            "scene": scene.name,
-            "renderer": f"mitsuba {runtime.mitsuba_version} {runtime.variant}",
-            "spp": str(spp),
-            "max_depth": str(max_depth),
-            "rr_depth": str(rr_depth),
-            "seed": str(seed),
-        },
-    )
-
-
-def render_one_hot(
-    scene: Scene,
-    *,
-    spp: int | None = None,
-    seed: int = 0,
-    max_depth: int | None = None,
-    rr_depth: int | None = None,
-    variant: str = "llvm_ad_mono",
-    progress: Progress | None = None,
-) -> Array:
-    """The transport matrix by Monte Carlo, shape (A, N, M): what each strip alone sends to each pixel.
-
-    The M columns of one view share their random numbers, so that any mixture of them is, up to rounding, what
-    rendering the mixture with the same seed would give. Parameters are those of `render_captures`.
-    """
-    renderer = Renderer(scene, variant=variant)
-    views, pixels, elements = scene.observer.views, scene.observer.pixels, scene.card.elements
-    transport = np.empty((views, pixels, elements))
-    for view, view_seed in enumerate(spread_seeds(seed, views)):
-        for element, pattern in enumerate(np.eye(elements)):
-            render = renderer.render(view, pattern, spp=spp, seeds=(view_seed,), max_depth=max_depth, rr_depth=rr_depth)
-            transport[view, :, element] = render.mean
-            if progress is not None:
-                progress(view * elements + element + 1, views * elements)
-    return transport
-
-
 def picture(
     scene: Scene,
     width: int = 640,
@@ -355,7 +261,7 @@ def picture(
     activate(variant)
     mi: Any = importlib.import_module("mitsuba")
     world = building.mitsuba_dict(scene, None, radiances=scene.source[:, realisation])
-    world["sensor"] = building.picture_sensor_dict(scene, width, height)
+    world["sensor"] = cameras.picture_sensor_dict(scene, width, height)
     depth = scene.render.max_depth if max_depth is None else max_depth
     world["integrator"] = building.integrator_dict(depth, scene.render.rr_depth, hide_emitters=False)
     loaded = mi.load_dict(world, optimize=False)

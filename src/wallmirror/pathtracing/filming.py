@@ -1,0 +1,107 @@
+"""Filming a Scene: all its captures, and the transport matrix by linearity."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wallmirror.captures import CaptureSet
+from wallmirror.pathtracing.rendering import Renderer, spread_seeds
+from wallmirror.scene import Scene
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+
+def render_captures(
+    scene: Scene,
+    *,
+    spp: int | None = None,
+    seed: int = 0,
+    max_depth: int | None = None,
+    rr_depth: int | None = None,
+    variant: str = "llvm_ad_mono",
+    progress: Progress | None = None,
+) -> CaptureSet:
+    """Render each view of each realisation on its own, with random numbers of its own.
+
+    Parameters
+    ----------
+    spp, max_depth, rr_depth:
+        Samples per pixel of each capture, and the depths; the scene's own where left out.
+    seed:
+        Root of all seeds, any integer >= 0.
+    progress:
+        Called with (captures done, captures in all).
+
+    Returns
+    -------
+    Radiance and variance, both (A, N, B), with the geometry; the variance is that of `Render.moment_variance`.
+    """
+    renderer = Renderer(scene, variant=variant)
+    settings = scene.render
+    spp = settings.spp if spp is None else spp
+    max_depth = settings.max_depth if max_depth is None else max_depth
+    rr_depth = settings.rr_depth if rr_depth is None else rr_depth
+    views, pixels, realisations = scene.observer.views, scene.observer.pixels, scene.source.shape[1]
+    radiance, variance = np.empty((2, views, pixels, realisations))
+    seeds = spread_seeds(seed, views * realisations)
+    for done, pass_seed in enumerate(seeds):
+        view, realisation = divmod(done, realisations)
+        render = renderer.render(
+            view,
+            scene.source[:, realisation],
+            spp=spp,
+            seeds=(pass_seed,),
+            max_depth=max_depth,
+            rr_depth=rr_depth,
+        )
+        radiance[view, :, realisation] = render.mean
+        variance[view, :, realisation] = render.variance
+        if progress is not None:
+            progress(done + 1, len(seeds))
+    runtime = renderer.runtime
+    return CaptureSet(
+        observer=scene.observer,
+        card=scene.card,
+        room=scene.room,
+        radiance=radiance,
+        variance=variance,
+        provenance={
+            "scene": scene.name,
+            "renderer": f"mitsuba {runtime.mitsuba_version} {runtime.variant}",
+            "spp": str(spp),
+            "max_depth": str(max_depth),
+            "rr_depth": str(rr_depth),
+            "seed": str(seed),
+        },
+    )
+
+
+def render_one_hot(
+    scene: Scene,
+    *,
+    spp: int | None = None,
+    seed: int = 0,
+    max_depth: int | None = None,
+    rr_depth: int | None = None,
+    variant: str = "llvm_ad_mono",
+    progress: Progress | None = None,
+) -> Array:
+    """The transport matrix by Monte Carlo, shape (A, N, M): what each strip alone sends to each pixel.
+
+    The M columns of one view share their random numbers, so that any mixture of them is, up to rounding, what
+    rendering the mixture with the same seed would give. Parameters are those of `render_captures`.
+    """
+    renderer = Renderer(scene, variant=variant)
+    views, pixels, elements = scene.observer.views, scene.observer.pixels, scene.card.elements
+    transport = np.empty((views, pixels, elements))
+    for view, view_seed in enumerate(spread_seeds(seed, views)):
+        for element, pattern in enumerate(np.eye(elements)):
+            render = renderer.render(view, pattern, spp=spp, seeds=(view_seed,), max_depth=max_depth, rr_depth=rr_depth)
+            transport[view, :, element] = render.mean
+            if progress is not None:
+                progress(view * elements + element + 1, views * elements)
+    return transport
