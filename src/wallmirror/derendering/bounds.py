@@ -47,18 +47,14 @@ class Bound:
 
     def brdf_std(self, grid: SplineGrid, u: Array) -> Array:
         """Standard deviation of rho at angle sums u in radians, same shape; inf where nothing was seen."""
-        rows = np.flatnonzero(self.seen)
-        position = np.full(grid.size, -1)
-        position[rows] = np.arange(rows.size)
+        position = np.where(self.seen, np.cumsum(self.seen) - 1, -1)
         first, values = grid.basis(u)
-        dense = np.zeros((u.size, rows.size))
-        blind = (u < grid.start) | (u > grid.stop)
-        for k in range(grid.degree + 1):
-            column = position[first + k]
-            blind |= (column < 0) & (values[k] > 1e-3)
-            inside = column >= 0
-            dense[np.flatnonzero(inside), column[inside]] += values[k][inside]
-        variance = np.einsum("uk,kl,ul->u", dense, self.coefficients, dense, optimize=True)
+        columns = position[first + np.arange(grid.degree + 1)[:, None]]  # (degree + 1, L)
+        missing = columns < 0
+        blind = (u < grid.start) | (u > grid.stop) | np.any(missing & (values > 1e-3), axis=0)
+        known = np.where(missing, 0.0, values)
+        # Only the degree + 1 coefficients around an angle have a say there.
+        variance = np.einsum("aL,bL,abL->L", known, known, self.coefficients[columns[:, None], columns])
         return np.where(blind, np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
 
@@ -121,7 +117,7 @@ def bound_of(
     # What the ridge alone holds, nothing holds: a bound on V that falls with it is none.
     if lost > 1e-3 or _scale_free_error(source, inverse, coupled, invert(10 * ridge)) < 0.8 * error:
         error = float("inf")
-    variance = np.einsum("bii->bi", inverse) + np.einsum("bik,kl,bil->bi", coupled, covariance, coupled, optimize=True)
+    variance = np.einsum("bii->bi", inverse) + np.sum((coupled @ covariance) * coupled, axis=-1)
     return Bound(
         coefficients=covariance,
         seen=seen,
@@ -149,7 +145,7 @@ def _scale_free_error(source: Array, inverse: Array, coupled: Array, covariance:
     if norm == 0:
         return float("inf")
     total = float(np.einsum("bii->", inverse))
-    total += float(np.einsum("bik,kl,bil->", coupled, covariance, coupled, optimize=True))
+    total += float(np.sum((coupled @ covariance) * coupled))
     # Along V: v^T Cov v / |V|^2.
     pulled = np.einsum("bi,bik->k", v, coupled)
     along = float(np.einsum("bi,bij,bj->", v, inverse, v)) + float(pulled @ covariance @ pulled)

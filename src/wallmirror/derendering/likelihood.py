@@ -140,12 +140,7 @@ def _fit(state: _State, iterations: int, *, converged: bool) -> Fit:
 
 def _evaluate(data: Moments, r: Array, v: Array | None, *, nonnegative: bool) -> _State:
     m = data.elements
-    pair = np.empty((len(data.grams), m, m, data.size))
-    for g, grams in enumerate(data.grams):
-        for (i, j), gram in grams.items():
-            pair[g, i, j] = gram @ r
-            if i != j:
-                pair[g, j, i] = gram.T @ r
+    pair = np.stack([pairs.times(r) for pairs in data.pairs])
     normal = pair @ r
     moment = data.cross @ r  # (B, M)
     if v is None:

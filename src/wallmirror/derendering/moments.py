@@ -9,6 +9,7 @@ so that an iteration of a fit does not touch the pixels.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,13 +24,48 @@ _SEEN = 1e-10
 
 
 @dataclass(frozen=True)
+class Pairs:
+    """All N_ij of one choice of weights, laid out so that neither of their two uses loops over pairs.
+
+    Parameters
+    ----------
+    stacked:
+        N_ij for every i and j one below the other, (i, j) = (0, 0), (0, 1), ..., csr (M M K, K).
+    where, values, counts:
+        Entries of N_ij for i <= j, (0, 0), (0, 1), (1, 1), (0, 2), ...: their place in a flat (K, K), their value (halved
+        for i = j), and how many each pair has.
+    diagonal:
+        Diagonal of sum_i N_ii, shape (K,).
+    """
+
+    stacked: sp.csr_array
+    where: NDArray[np.int64]
+    values: Array
+    counts: NDArray[np.intp]
+    diagonal: Array
+
+    def times(self, r: Array) -> Array:
+        """N_ij r, shape (M, M, K)."""
+        elements = math.isqrt(self.stacked.shape[0] // r.size)
+        return np.asarray((self.stacked @ r).reshape(elements, elements, r.size))
+
+    def mixed(self, products: Array) -> Array:
+        """sum_ij products_ij N_ij for symmetric products (M, M), dense (K, K)."""
+        size = self.stacked.shape[1]
+        factors = np.concatenate([products[: j + 1, j] for j in range(products.shape[0])])
+        half = np.bincount(self.where, weights=self.values * np.repeat(factors, self.counts), minlength=size * size)
+        square = np.asarray(half, dtype=np.float64).reshape(size, size)
+        return square + square.T
+
+
+@dataclass(frozen=True)
 class Moments:
     """The data in coefficient space.
 
     Parameters
     ----------
-    grams:
-        N_ij for i <= j and each group of realisations that share weights, csr (K, K).
+    pairs:
+        The N_ij of each group of realisations that share weights.
     group:
         Group of each realisation, shape (B,).
     cross:
@@ -40,7 +76,7 @@ class Moments:
         Number of data with weight > 0.
     """
 
-    grams: list[dict[tuple[int, int], sp.csr_array]]
+    pairs: list[Pairs]
     group: NDArray[np.intp]
     cross: Array
     energy: Array
@@ -59,11 +95,8 @@ class Moments:
     @cached_property
     def exposure(self) -> Array:
         """How well each coefficient is seen, relative to the best-seen one, shape (K,)."""
-        total = np.zeros(self.size)
-        for grams in self.grams:
-            for i in range(self.elements):
-                total += grams[i, i].diagonal()
-        return total / max(float(total.max(initial=0.0)), 1e-300)
+        total = np.sum([pairs.diagonal for pairs in self.pairs], axis=0)
+        return np.asarray(total / max(float(total.max(initial=0.0)), 1e-300))
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -73,15 +106,9 @@ class Moments:
     def gram_of_source(self, v: Array) -> Array:
         """sum_b J_b^T W J_b, dense (K, K), for v of shape (B, M)."""
         total = np.zeros((self.size, self.size))
-        for g, grams in enumerate(self.grams):
+        for g, pairs in enumerate(self.pairs):
             rows = v[self.group == g]
-            products = rows.T @ rows
-            for (i, j), gram in grams.items():
-                coo = gram.tocoo()
-                row, column = coo.coords
-                total[row, column] += products[i, j] * coo.data
-                if i != j:
-                    total[column, row] += products[i, j] * coo.data
+            total += pairs.mixed(rows.T @ rows)
         return total
 
 
@@ -101,9 +128,8 @@ def moments(data: Array, designs: list[sp.csr_array], inverse_variance: Array | 
     full = np.broadcast_to(weights, data.shape) if weights.shape[1] == 1 else weights[:, group]
     weighted = full * data
     cross = np.stack([(t.T @ weighted).T for t in designs], axis=1)
-    grams = [_grams(designs, weights[:, g]) for g in range(weights.shape[1])]
     return Moments(
-        grams=grams,
+        pairs=[_pairs(designs, weights[:, g]) for g in range(weights.shape[1])],
         group=group,
         cross=cross,
         energy=np.sum(weighted * data, axis=0),
@@ -120,11 +146,30 @@ def _alike(inverse_variance: Array) -> tuple[Array, NDArray[np.intp]]:
     return weights, np.asarray(group).ravel().astype(np.intp)
 
 
-def _grams(designs: list[sp.csr_array], weight: Array) -> dict[tuple[int, int], sp.csr_array]:
-    grams = {}
+def _pairs(designs: list[sp.csr_array], weight: Array) -> Pairs:
+    elements, size = len(designs), designs[0].shape[1]
+    transposed = [sp.csr_array(t.T) for t in designs]
+    blocks: dict[tuple[int, int], sp.csr_array] = {}
+    where, values, diagonal = [], [], np.zeros(size)
     for j, right in enumerate(designs):
-        scaled = right.copy()
-        scaled.data = scaled.data * np.repeat(weight, np.diff(scaled.indptr))
+        scaled = sp.csr_array(
+            (right.data * np.repeat(weight, np.diff(right.indptr)), right.indices, right.indptr), right.shape
+        )
         for i in range(j + 1):
-            grams[i, j] = sp.csr_array(designs[i].T @ scaled)
-    return grams
+            gram = sp.csr_array(transposed[i] @ scaled)
+            blocks[i, j] = gram
+            row = np.repeat(np.arange(size, dtype=np.int64), np.diff(gram.indptr))
+            where.append(row * size + gram.indices)
+            if i == j:
+                diagonal += gram.diagonal()
+                values.append(0.5 * gram.data)
+            else:
+                blocks[j, i] = sp.csr_array(gram.T)
+                values.append(gram.data)
+    return Pairs(
+        stacked=sp.csr_array(sp.vstack([blocks[i, j] for i in range(elements) for j in range(elements)], format="csr")),
+        where=np.concatenate(where),
+        values=np.concatenate(values),
+        counts=np.array([v.size for v in values]),
+        diagonal=diagonal,
+    )
