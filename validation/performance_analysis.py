@@ -119,7 +119,9 @@ def code_of(method: str) -> str:
     if method in (TEXT, RECORDED):
         files += [package / "derendering" / f"{name}.py" for name in _ALTERNATION]
     else:
-        files += [path for path in sorted((package / "derendering").glob("*.py")) if path.stem not in _ELSEWHERE]
+        files += [
+            path for path in sorted((package / "derendering").glob("*.py")) if not path.stem.startswith(_ELSEWHERE)
+        ]
     digest = hashlib.sha256()
     for path in files:
         digest.update(path.read_bytes())
@@ -288,6 +290,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="4 values and 4 repetitions, written under out/")
     parser.add_argument("--only", action="append", choices=list(sweeps()), help="this sweep only (repeatable)")
+    parser.add_argument("--repetitions", type=int, help="at most so many of each cell, to see something sooner")
     parser.add_argument("--jobs", type=int, default=-1, help="processes; all processors if left out")
     parser.add_argument("--dask", metavar="ADDRESS", help="of a Dask scheduler, to work on its cluster instead")
     parser.add_argument("--page", action="store_true", help="make page and figures anew from the results, run nothing")
@@ -299,13 +302,14 @@ def main() -> int:
     path = out / "results" / "performance_analysis.json"
     if not arguments.page:
         work = arguments.work or spare / "cells"
-        repetitions = dict.fromkeys(REPETITIONS, 4) if arguments.quick else REPETITIONS
+        most = arguments.repetitions or (4 if arguments.quick else max(REPETITIONS.values()))
+        repetitions = {method: min(most, usual) for method, usual in REPETITIONS.items()}
         places = chosen(arguments.only, quick=arguments.quick)
         document = analyse(places, work, repetitions, jobs=arguments.jobs, dask=arguments.dask)
         if path.exists():
             document = merged(json.loads(path.read_text()), document, whole=arguments.only is None)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(document, indent=1) + "\n")
+        path.write_text(json.dumps(document, separators=(",", ":")) + "\n")
     from performance_page import write  # matplotlib only where it is needed
 
     print(f"Wrote {write(json.loads(path.read_text()), out)}")

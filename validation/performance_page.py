@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,8 @@ from performance_figures import NAMES, Row, crossed_figure, example, sweep_figur
 
 #: A relative error of the pattern below which it counts as recovered.
 RECOVERED = 1e-6
-#: One below which it looks close, as in figure 4.3.
-_CLOSE = 0.1
+#: One below which an estimate looks close, as in figure 4.3.
+_CLOSE = 0.2
 HEADINGS = {
     "N": "Figure 4.5: number of wall points N",
     "A": "Figure 4.6: number of views A",
@@ -101,7 +102,7 @@ The verdicts follow from the numbers. *Confirmed*: the conclusion holds for the 
 *Corrected*: it holds for the algorithm, but the exact solver, on the same captures, does not show it. *Refuted*: it does
 not hold for the algorithm either, in the settings of table 4.3. Means count as different from three standard errors on,
 and a pattern as recovered below a relative error of {RECOVERED:.0e}.""",
-        "Cells that the closed form **refuses** are crosses in the figures. Its reason: " + "; ".join(reasons) + "."
+        "Cells that the closed form **refuses** are crosses in the figures. Its reason:\n" + "; ".join(reasons) + "."
         if reasons
         else "No cell was refused.",
     ]
@@ -109,7 +110,10 @@ and a pattern as recovered below a relative error of {RECOVERED:.0e}.""",
 
 def _searched(known: dict[str, dict[str, Row]]) -> str:
     """What the search made of the cells with fewer patterns than source points, in a sentence."""
-    rows = [row[FEW] for values in known.values() for row in values.values() if FEW in row]
+    # Sweeps share cells; each counts once.
+    rows = {
+        json.dumps(row[FEW]): row[FEW] for values in known.values() for row in values.values() if FEW in row
+    }.values()
     found = [row for row in rows if "source_error" in row]
     if not found:
         return ""
@@ -144,7 +148,7 @@ The thesis shows "a successful algorithm iteration". This is repetition {repetit
                     verdict(
                         theirs["source_error"] < _CLOSE,
                         ours["source_error"] < _CLOSE,
-                        "even the luckiest run is far off",
+                        "even the luckiest run is off",
                     ),
                 ),
                 (
@@ -307,6 +311,7 @@ def _crossed(values: dict[str, Row]) -> list[Line]:
     measure = "brdf_mse"
     better = sum(lower(values[f"{a} x {patterns[-1]}"], values[f"{a} x {patterns[0]}"], measure) for a in views)
     worse = sum(lower(values[f"{views[0]} x {b}"], values[f"{views[-1]} x {b}"], measure) for b in patterns)
+    spared = sum(lower(values[f"{views[-1]} x {b}"], values[f"{views[0]} x {b}"], measure) for b in patterns)
     found = solved(values)
     # A trend of the exact solver would be one that leaves the size of rounding.
     mine = f"no solved cell's pattern is more than {worst(found):.0e} off"
@@ -321,9 +326,11 @@ def _crossed(values: dict[str, Row]) -> list[Line]:
         ),
         (
             "raising A worsens the BRDF",
-            f"A = {views[-1]} is worse than A = {views[0]} at {worse} of {len(patterns)} B",
+            f"A = {views[-1]} is worse than A = {views[0]} at {worse} of {len(patterns)} B, and better at {spared}",
             mine,
-            verdict(worse > 0.8 * len(patterns), worst(found) > RECOVERED, "it is the chaining that errs"),
+            verdict(
+                2 * worse >= len(patterns) and not spared, worst(found) > RECOVERED, "it is the chaining that errs"
+            ),
         ),
     ]
 

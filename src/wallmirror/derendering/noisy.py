@@ -33,6 +33,8 @@ _NEARLY_THERE = 3.0
 # which the gap says that they are too fine.
 _FAR_OFF = 2.0
 _GAP = 1.0
+# A misfit that falls by this factor when the knots are halved has not come down to the noise.
+_PLATEAU = 10.0
 # The pattern may move by this many of its error bars when the knots are halved.
 _STEADY = 3.0
 
@@ -91,7 +93,19 @@ def solve_noisy(
     sigma = math.sqrt(max(1.0, reduced) if stated else reduced)
     require_patterns(problem, transport, fit.source, sigma)
     predicted = sigma * bound.source_error
+    shape_std = sigma * bound.shape_std
     warnings = []
+    if not stated and _still_falls(refined):
+        # What is left is the spline's own error, which the bound knows nothing of.
+        assert refined.before is not None
+        moved = scale_free_error(refined.before.source, fit.source)
+        if moved > predicted:
+            shape_std = shape_std * (moved / predicted)
+            predicted = moved
+            warnings.append(
+                "the misfit still falls with finer knots than the captures allow, so it is no noise; the error bars are how "
+                "far the pattern moved when the knots were last halved"
+            )
     if not fit.converged:
         warnings.append("the fit stopped before it converged, so the error bars may be too small")
     if stated and reduced > 1.2:
@@ -115,7 +129,7 @@ def solve_noisy(
         transport=transport,
         peak_at=level.peak_at,
         source_std=sigma * bound.source_std,
-        shape_std=sigma * bound.shape_std,
+        shape_std=shape_std,
         brdf_std=lambda u: sigma * bound.brdf_std(grid, u),
         predicted_error=predicted,
         chi_squared=reduced if stated else math.nan,
@@ -125,11 +139,12 @@ def solve_noisy(
 
 @dataclass(frozen=True)
 class Refined:
-    """The level that the data chose, its bound, and the fit on finer knots that did not pay, if one was tried."""
+    """The level that the data chose, its bound, and the fits on finer knots that did not pay and on the coarser before."""
 
     level: Level
     bound: Bound
     rival: Fit | None
+    before: Fit | None
 
 
 def refine(
@@ -152,7 +167,15 @@ def refine(
         # Knots so fine that some cells are determined by nothing: those before them explain nearly as much.
         levels, rival = levels[:-1], None
         bound = levels[-1].bound()
-    return Refined(levels[-1], bound, rival)
+    return Refined(levels[-1], bound, rival, levels[-2].fit if len(levels) > 1 else None)
+
+
+def _still_falls(refined: Refined) -> bool:
+    """Whether the last halving of the knots took most of the misfit away and no finer knots show where it ends."""
+    before, fit, rival = refined.before, refined.level.fit, refined.rival
+    if before is None or before.objective < _PLATEAU * fit.objective:
+        return False
+    return rival is None or rival.objective < fit.objective / 2
 
 
 def _halve(

@@ -69,7 +69,7 @@ def beyond_one_bounce(
         Directional albedo of the wall at normal incidence.
     """
     card, room = captures.card, captures.room
-    if (card.albedo == 0 or card.is_points) and (room is None or room.albedo == 0):
+    if not _sends_back(captures):
         return None
     nodes = np.linspace(angle_sum[0], angle_sum[-1], angle_sum.size)
     values = np.maximum(np.interp(nodes, angle_sum, brdf), 0.0)
@@ -83,6 +83,11 @@ def beyond_one_bounce(
     if room is not None:
         extra += from_room(captures.observer, card, room, absolute, level)
     return extra
+
+
+def _sends_back(captures: CaptureSet) -> bool:
+    card, room = captures.card, captures.room
+    return (card.albedo > 0 and not card.is_points) or (room is not None and room.albedo > 0)
 
 
 def check_one_bounce(
@@ -126,6 +131,8 @@ def _further_light(
     problem: Problem, grid: SplineGrid, coefficients: Array, source: Array, wall_albedo: float
 ) -> Array | None:
     """`beyond_one_bounce` of an estimate in the problem's normalised data, (P, B)."""
+    if not _sends_back(problem.captures):
+        return None
     u = np.linspace(grid.start, grid.stop, 8 * grid.intervals + 1)
     extra = beyond_one_bounce(
         problem.captures, u, grid.evaluate(coefficients, u), source * problem.scale, wall_albedo=wall_albedo

@@ -44,6 +44,10 @@ class SolveOptions(TypedDict, total=False):
 
 # Below this mismatch the data count as free of noise: float64 renders end near 1e-24, float32 files near 1e-13.
 _NOISELESS = 1e-15
+# Noise that would make no larger mismatch than this is rounding.
+_SILENT = 1e-20
+# Without noise the closed form is taken up to this error: a misfit that is no noise would give a likelihood false bars.
+_KNOWN = 0.1
 
 
 def solve(
@@ -141,9 +145,11 @@ def solve(
         elif method == "closed_form" or (method == "auto" and _may_be_exact(problem, space)):
             tell("closed form")
             exact = solve_exactly(problem, space, steps or EXACT_STEPS)
-            # Knots as fine as the pixels fit noise as well: the singular values beyond M must find none either.
+            # The singular values beyond M tell noise best: knots as fine as the pixels fit noise as well. Where there are
+            # none beyond, a mismatch near rounding has to do.
             noise = expected_mismatch(problem, space, exact.closed)
-            if method == "closed_form" or (exact.closed.mismatch < _NOISELESS and not noise > _NOISELESS):
+            quiet = exact.closed.mismatch < _NOISELESS if math.isnan(noise) else noise < _SILENT
+            if method == "closed_form" or (quiet and exact.predicted_error <= _KNOWN):
                 estimate = exact
         if estimate is None:
             tell("maximum likelihood")

@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 # Above this many elements the M^2 x M^2 matrix is not formed; Lanczos finds its two leading pairs.
 _DENSE_ELEMENTS = 16
 _RIDGE = 1e-13
+_NO_RIVAL = 0.01
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class ClosedForm:
     gap:
         1 - lambda_2: how far the second-best BRDF is from explaining the data; 0 means undetermined.
     near_solutions:
-        Number of orthogonal BRDFs that explain the data as well as the best within a factor of 100.
+        Number of orthogonal BRDFs that explain the data as well as the best within a factor of 100, and to 1 %.
     exposure:
         How well each coefficient is seen, 1 for the best-seen, shape (K,).
     """
@@ -185,7 +186,8 @@ def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) ->
     if source.sum() < 0:  # the light is positive; r itself may be ruled by cells that hardly anybody saw
         scale, source = -scale, -source
     lost = 1 - values
-    near = int(np.count_nonzero(lost < 100 * max(mismatch, 1e-15 * size)))
+    # A rival explains the data nearly as well; one that misses more than a hundredth of them is none, however noisy they are.
+    near = int(np.count_nonzero(lost < min(100 * max(mismatch, 1e-15 * size), _NO_RIVAL)))
     return ClosedForm(
         coefficients=r * scale,
         transport=(u @ projected) * scale,
@@ -209,11 +211,11 @@ def banded_gram(designs: list[sp.csr_array]) -> Array:
         return _band_of(sp.csr_array(sum(t.T @ t for t in designs)))
     band = np.zeros((max(widths), size))
     for t, width in zip(designs, widths, strict=True):
-        data, first = t.data.reshape(-1, width), t.indices[::width]
+        columns, first = np.ascontiguousarray(t.data.reshape(-1, width).T), t.indices[::width].astype(np.intp)
         for d in range(width):
-            products = data[:, : width - d] * data[:, d:]
-            columns = first[:, None] + np.arange(width - d)
-            band[d] += np.bincount(columns.ravel(), weights=products.ravel(), minlength=size)
+            for k in range(width - d):
+                sums = np.bincount(first, weights=columns[k] * columns[k + d], minlength=size)
+                band[d, k:] += sums[: size - k]
     return band
 
 
