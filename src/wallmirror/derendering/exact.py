@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,44 +16,36 @@ from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form
 
 Array = NDArray[np.float64]
 
-#: Knot spacings in degrees, tried in turn while finer ones still pay.
-EXACT_STEPS = (1.0, 0.25, 0.125, 0.0625, 0.03125)
+#: Knot spacings in degrees: the search begins with the first, goes through the others in turn while finer ones pay, and if
+#: none does, through coarser ones.
+EXACT_STEPS = (0.25, 0.125, 0.0625, 0.03125)
+COARSER_STEPS = (0.5, 1.0, 2.0, 4.0)
 _DEGREE = 7
 # At this mismatch rounding is all that is left: finer knots could only add to it.
 _EXACT = 3e-23
 _ROUNDING = 1e-15
+# A gap that leaves no doubt: knots that reach rounding with it need no others beside them.
+_CLEAR = 1e-3
 # Knots whose own bound is above this have no say in how far the pattern moves.
 _WORTH_A_LOOK = 0.1
 
 
-def solve_exactly(problem: Problem, space: SignalSpace, steps: tuple[float, ...] = EXACT_STEPS) -> Estimate:
-    """Refine the knots while that halves the error bound and rounding is not reached, then try a spacing in between.
+@dataclass(frozen=True)
+class _Try:
+    grid: SplineGrid
+    closed: ClosedForm
+    designs: list[sp.csr_array]
+
+
+def solve_exactly(problem: Problem, space: SignalSpace, *, step_deg: float | None = None) -> Estimate:
+    """Change the knots while that halves the error bound and rounding is not reached.
 
     The error that is stated is the largest of three: the bound on r that mismatch and gap give, what rounding becomes
     by the condition of F, and how far the pattern moves on the next-best knots. Where no other knots have an answer
     worth the name, the bound on r is multiplied by the condition instead.
     """
-
-    def at(step: float) -> tuple[SplineGrid, ClosedForm, list[sp.csr_array]]:
-        grid, designs = problem.designs(step, degree=_DEGREE, tolerance=1e-9)
-        return grid, closed_form(problem.weighted_data, problem.weighted(designs), space), designs
-
-    grid, closed, designs = at(steps[0])
-    others: list[ClosedForm] = []
-    for step in steps[1:]:
-        if closed.mismatch < _EXACT:
-            break
-        finer = at(step)
-        # Not the mismatch alone: a grid finer than the pixels fits anything, and its gap says so.
-        if finer[1].error > closed.error / 2:
-            others.append(finer[1])
-            halfway = at(2 * step)
-            if halfway[1].error < closed.error / 2:
-                others.append(closed)
-                grid, closed, designs = halfway
-            break
-        others.append(closed)
-        grid, closed, designs = finer
+    best, others = _search(problem, space, step_deg)
+    grid, closed, designs = best.grid, best.closed, best.designs
     condition = float(np.linalg.cond(closed.transport))
     error = max(closed.error, _ROUNDING * condition)
     rivals = [other for other in others if other.error < _WORTH_A_LOOK]
@@ -87,3 +80,34 @@ def solve_exactly(problem: Problem, space: SignalSpace, steps: tuple[float, ...]
         chi_squared=math.nan,
         warnings=warnings,
     )
+
+
+def _search(problem: Problem, space: SignalSpace, step_deg: float | None) -> tuple[_Try, list[ClosedForm]]:
+    """The best knots, and the closed forms on the others that were tried."""
+
+    def at(step: float) -> _Try:
+        grid, designs = problem.designs(step, degree=_DEGREE, tolerance=1e-9)
+        return _Try(grid, closed_form(problem.weighted_data, problem.weighted(designs), space), designs)
+
+    if step_deg is not None:
+        return at(step_deg), []
+    first = best = at(EXACT_STEPS[0])
+    others: list[ClosedForm] = []
+    for steps in (EXACT_STEPS[1:], COARSER_STEPS):
+        if best is not first:
+            break  # finer knots paid, so coarser ones cannot
+        for step in steps:
+            if best.closed.mismatch < _EXACT and best.closed.gap > _CLEAR:
+                return best, others
+            if best.closed.mismatch < _EXACT and steps is not COARSER_STEPS:
+                break  # these fit whatever there is
+            # Not the mismatch alone: a grid finer than the pixels fits anything, and its gap says so.
+            other = at(step)
+            if other.closed.error > best.closed.error / 2:
+                others.append(other.closed)
+                if steps is COARSER_STEPS and best.closed.error > _WORTH_A_LOOK:
+                    continue  # all knots so far are finer than the pixels
+                break
+            others.append(best.closed)
+            best = other
+    return best, others

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.counting import solve_counts, with_counting_noise
-from wallmirror.derendering.exact import EXACT_STEPS, solve_exactly
+from wallmirror.derendering.exact import solve_exactly
 from wallmirror.derendering.noisy import NOISY_STEPS, solve_noisy
 from wallmirror.derendering.one_bounce import check_one_bounce
 from wallmirror.derendering.problem import Problem, expected_mismatch, prepare
@@ -144,7 +144,7 @@ def solve(
             )
         elif method == "closed_form" or (method == "auto" and _may_be_exact(problem, space)):
             tell("closed form")
-            exact = solve_exactly(problem, space, steps or EXACT_STEPS)
+            exact = solve_exactly(problem, space, step_deg=step_deg)
             # The singular values beyond M tell noise best: knots as fine as the pixels fit noise as well. Where there are
             # none beyond, a mismatch near rounding has to do.
             noise = expected_mismatch(problem, space, exact.closed)
