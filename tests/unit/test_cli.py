@@ -3,11 +3,12 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from wallmirror import CaptureSet, load_scene, radiance, transport_matrix, write_captures
+from wallmirror import CaptureSet, load_scene, radiance, scale_free_error, transport_matrix, write_captures
 from wallmirror.cli import main
 from wallmirror.jobs.capturing import truth_of
 
@@ -139,7 +140,6 @@ def test_bad_captures_are_one_sentence_exit_2_and_nothing_lost(capsys, folder, t
 def test_undetermined_is_exit_3_with_what_would_help(capsys, scene, tmp_path):
     for number, (source, words) in enumerate(
         [
-            (scene.source[:, :2], "at least 3 different patterns"),
             (np.zeros_like(scene.source), "light the card"),
             (np.repeat(scene.source[:, :1], 4, axis=1), "more different patterns"),
         ]
@@ -155,6 +155,90 @@ def test_undetermined_is_exit_3_with_what_would_help(capsys, scene, tmp_path):
         assert words in err
         assert json.loads(out)["exit_code"] == 3
         assert not (tmp_path / f"out{number}").exists()
+
+
+def test_fewer_captures_than_elements_are_solved_unless_the_method_needs_more(capsys, scene, tmp_path):
+    folder = tmp_path / "set"
+    write_captures(folder, captures_of(scene, scene.source[:, :2]))
+    code, out, err = run(capsys, "solve", folder, "-o", tmp_path / "out", "--json")
+    document = json.loads(out)
+    assert code == 0
+    assert document["method"] == "few_captures"
+    assert document["priors"] == ["rho >= 0 and V >= 0"]
+    assert "few captures" in err
+    found = np.array(document["source"])
+    assert scale_free_error(found, scene.source[:, :2]) < 5 * document["predicted_error"] < 0.5
+    code, out, err = run(capsys, "solve", folder, "-o", tmp_path / "no", "--method", "closed_form", "--json")
+    assert code == 3
+    assert "at least 3 different patterns" in err
+    assert json.loads(out)["exit_code"] == 3
+    assert not (tmp_path / "no").exists()
+    # A support has a meaning for few captures, a negative one has none.
+    code, _, err = run(capsys, "solve", folder, "-o", tmp_path / "no", "--support-deg", "-5")
+    assert code == 2
+    assert "support_deg" in err
+
+
+def test_a_known_level_settles_the_scale(capsys, folder, scene, tmp_path):
+    level = float(scene.source.mean())
+    code, out, _ = run(
+        capsys, "solve", folder, "-o", tmp_path / "out", "--scale", "level", "--source-level", level, "--json"
+    )
+    document = json.loads(out)
+    assert code == 0
+    assert document["gauge"] == f"mean of the pattern = {level:g}"
+    found = np.array(document["source"])
+    assert found.mean() == pytest.approx(level, rel=1e-12)
+    # The absolute pattern: what is left is the noise, no scale.
+    off = np.linalg.norm(found - scene.source) / np.linalg.norm(scene.source)
+    assert off < 4 * document["predicted_error"]
+    for options, field in (
+        (["--scale", "level"], "source_level"),
+        (["--scale", "albedo"], "wall_albedo"),
+        (["--scale", "loud"], "scale"),
+    ):
+        code, _, err = run(capsys, "solve", folder, "-o", tmp_path / "no", *options)
+        assert code == 2
+        assert field in err
+        assert not (tmp_path / "no").exists()
+
+
+def test_a_card_that_stood_elsewhere_is_found_first(capsys, scene, tmp_path):
+    observer = replace(scene.observer, pixels=120, view_angles=tuple(np.linspace(*scene.observer.view_angles[::2], 4)))
+    films = radiance(transport_matrix(observer, scene.card, scene.wall.brdf, tolerance=1e-8), scene.source)
+    believed = replace(scene.card, y=1.05 * scene.card.y)
+    folder = tmp_path / "set"
+    write_captures(folder, CaptureSet(observer=observer, card=believed, radiance=films))
+    code, out, err = run(capsys, "solve", folder, "-o", tmp_path / "out", "--calibrate", "--json")
+    document = json.loads(out)
+    assert code == 0
+    assert document["verdict"] == "good"
+    assert scale_free_error(np.array(document["source"]), scene.source) < 1e-5
+    # The files hold float32: films right to 6e-8, the card to some hundred times that at most.
+    assert document["calibration"]["y"] == pytest.approx(scene.card.y, abs=1e-5)
+    assert document["calibration"]["metres"]["y"] == pytest.approx(scene.card.y, abs=1e-5)
+    assert document["calibration"]["elements_x"] == pytest.approx(scene.card.elements_x, abs=1e-5)
+    assert 0 < document["calibration"]["metres_std"]["y"] < 1e-4
+    assert document["calibration"]["status"] in err
+    # The planted fault: solved as it stands, five per cent too far away.
+    code, out, _ = run(capsys, "solve", folder, "-o", tmp_path / "as_is", "--json")
+    as_is = json.loads(out)
+    assert "calibration" not in as_is
+    assert code == 3 or as_is["verdict"] == "doubtful"
+
+
+def test_counts_need_their_unit(capsys, folder, tmp_path):
+    code, out, err = run(capsys, "solve", folder, "-o", tmp_path / "no", "--method", "poisson")
+    assert code == 2
+    assert "counts_per_radiance" in err
+    assert out == ""
+    assert run(capsys, "solve", folder, "-o", tmp_path / "no", "--counts", "1e4")[0] == 2
+    assert not (tmp_path / "no").exists()
+    code, out, _ = run(
+        capsys, "solve", folder, "-o", tmp_path / "out", "--method", "poisson", "--counts", "1e6", "--json"
+    )
+    assert code == 0
+    assert json.loads(out)["method"] == "poisson"
 
 
 def test_unknown_scene_and_method_are_exit_2(capsys, folder, tmp_path):

@@ -15,6 +15,9 @@ from wallmirror.derendering.poisson import maximise_poisson, poisson_bound
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.subspace import SignalSpace
 
+# Counts that scatter less than this share of what counting makes are none.
+_TOO_QUIET = 0.8
+
 
 def with_counting_noise(captures: CaptureSet, *, per_radiance: float, background: float) -> CaptureSet:
     """The captures with variances that counting gives each pixel, its mean over the realisations taken as its rate.
@@ -83,6 +86,11 @@ def solve_counts(
         warnings.append(
             f"the counts scatter {fit.chi_squared:.2f} times as much as counting alone, so the model or the counts per "
             "radiance do not hold; the error bars were widened to match"
+        )
+    if fit.chi_squared < _TOO_QUIET:
+        warnings.append(
+            f"the counts scatter only {fit.chi_squared:.2g} times as much as counting makes them, so they are no counts or the "
+            "counts per radiance are too few; the error bars are too wide"
         )
     return Estimate(
         method="poisson",

@@ -6,13 +6,15 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spl
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
 from wallmirror.brdf import AngleSumBRDF
 from wallmirror.derendering.bounds import cramer_rao
 from wallmirror.derendering.likelihood import information, moments
-from wallmirror.derendering.splines import design_matrices, grid_for
+from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
 from wallmirror.errors import InputError
 from wallmirror.geometry import Card, Observer
 from wallmirror.transport import Weights, build_kernel, radiance, transport_matrix
@@ -87,11 +89,13 @@ def foresee(
     source = np.asarray(source, dtype=np.float64)
     if source.ndim != 2 or source.shape[0] != card.elements:
         raise InputError(f"has shape {source.shape}; give one row for each of {card.elements} elements", field="source")
+    if source.shape[1] == 0 or not np.all(np.isfinite(source)) or not np.any(source):
+        raise InputError("needs at least one pattern, finite and not all dark", field="source")
     shape = (observer.views, observer.pixels, source.shape[1])
     try:
         spread = np.broadcast_to(np.asarray(noise, dtype=np.float64), shape)
     except ValueError:
-        raise InputError(f"does not fit captures of shape {shape}", field="noise") from None
+        raise InputError(f"is no number, nor an array that fits captures of shape {shape}", field="noise") from None
     if not (np.all(np.isfinite(spread)) and np.all(spread > 0)):
         raise InputError("holds a standard deviation that is not positive and finite", field="noise")
     if step_deg is not None and not 0.001 <= step_deg <= 45:
@@ -105,7 +109,7 @@ def foresee(
         films = radiance(transport, source).reshape(-1, source.shape[1])
         inverse = 1 / spread.reshape(films.shape) ** 2
         summed = moments(films, designs, inverse)
-        coefficients = grid.interpolate(brdf.of_sum)
+        coefficients = _closest(grid, brdf)
         peak_at = grid.peak(coefficients, summed.exposure)
         bound = cramer_rao(summed, coefficients, source, gauge=grid.row(peak_at))
         # F's own error: E |dF|^2 = sum_i tr(T_i Cov T_i^T), less what lies along F, which the scale absorbs.
@@ -125,3 +129,13 @@ def foresee(
         known_brdf_error=known,
         step_deg=step,
     )
+
+
+def _closest(grid: SplineGrid, brdf: AngleSumBRDF) -> Array:
+    """Coefficients of the spline nearest to a BRDF in the mean square, from four samples a knot interval, shape (K,)."""
+    u = np.linspace(grid.start, grid.stop, 4 * grid.size)
+    first, values = grid.basis(u)
+    rows = np.broadcast_to(np.arange(u.size), values.shape)
+    columns = first + np.arange(grid.degree + 1)[:, None]
+    basis = sp.csc_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(u.size, grid.size))
+    return np.asarray(spl.spsolve(sp.csc_array(basis.T @ basis), basis.T @ brdf.of_sum(u)), dtype=np.float64)

@@ -156,17 +156,27 @@ def refine(
     tell: Callable[[str], None],
 ) -> Refined:
     """Halve the knot spacing while that pays, and go back where the bound says that nothing determines the finest."""
-    try:
-        levels, rival = _halve(problem, space, steps, nonnegative, tell)
-    except UndeterminedError:
-        if space.rank < problem.card.elements:
-            raise too_few_patterns(space.rank, problem.card.elements) from None
-        raise
-    bound = levels[-1].bound()
-    while len(levels) > 1 and not math.isfinite(bound.source_error):
+    begin = _first_worth_a_fit(problem, space, steps)
+    while True:
+        try:
+            levels, rival = _halve(problem, space, steps[begin:], nonnegative, tell)
+        except UndeterminedError:
+            if begin == 0 and space.rank < problem.card.elements:
+                raise too_few_patterns(space.rank, problem.card.elements) from None
+            if begin == 0:
+                raise
+            levels, rival = [], None
         # Knots so fine that some cells are determined by nothing: those before them explain nearly as much.
-        levels, rival = levels[:-1], None
-        bound = levels[-1].bound()
+        while levels and not math.isfinite(levels[-1].bound().source_error):
+            levels, rival = levels[:-1], None
+        if levels or begin == 0:
+            break
+        begin, steps = begin - 1, steps[:begin]
+    if not levels:
+        raise UndeterminedError(
+            "the captures leave the pattern undetermined on the coarsest knots already; capture more light, views or patterns"
+        )
+    bound = levels[-1].bound()
     return Refined(levels[-1], bound, rival, levels[-2].fit if len(levels) > 1 else None)
 
 
@@ -189,7 +199,7 @@ def _halve(
     levels: list[Level] = []
     rival: Fit | None = None
     idle = 0
-    for step in steps[_first_worth_a_fit(problem, space, steps) :]:
+    for step in steps:
         best = levels[-1] if levels else None
         grid, designs = problem.designs(step, degree=_DEGREE, tolerance=1e-5)
         summed = moments(problem.data, designs, problem.inverse_variance)

@@ -10,11 +10,14 @@ import numpy as np
 from wallmirror.derendering.bounds import cramer_rao
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.few_captures import STEPS, few_captures
-from wallmirror.derendering.likelihood import best_nonnegative, maximise, moments
+from wallmirror.derendering.likelihood import Fit, best_nonnegative, maximise, moments
 from wallmirror.derendering.problem import Problem
+from wallmirror.derendering.splines import SplineGrid
 
 # A residual below this is a spline's own error or rounding, and no noise that a likelihood could weigh.
 _NOISELESS = 1e-6
+# Misfit that each coefficient beyond the support takes away, in units of the noise, from which on it is no chance.
+_BEYOND = 5.0
 
 
 def solve_scarce(
@@ -79,6 +82,11 @@ def solve_scarce(
     bound = cramer_rao(summed, fit.coefficients, fit.source, gauge=grid.row(peak_at))
     if not fit.converged:
         warnings = ("the fit stopped before it converged, so the error bars may be too small",)
+    if support is not None and _reaches_beyond(problem, grid, fit, missed):
+        warnings += (
+            f"the captures are explained far better by a BRDF that reaches beyond {math.degrees(support):g} deg, so the "
+            "support that was named does not hold; the error bars do not know that",
+        )
     if stated and reduced > 1.2:
         warnings += (f"the misfit is {reduced:.2f} times the stated noise; the error bars were widened to match",)
     return Estimate(
@@ -97,3 +105,13 @@ def solve_scarce(
         warnings=warnings,
         priors=tuple(priors),
     )
+
+
+def _reaches_beyond(problem: Problem, grid: SplineGrid, fit: Fit, missed: float) -> bool:
+    """Whether the pattern that was found has a far smaller misfit once the BRDF may reach beyond its support."""
+    _, designs = problem.designs(math.degrees(grid.step), degree=grid.degree, tolerance=1e-5)
+    summed = moments(problem.data, designs, problem.inverse_variance)
+    free = maximise(summed, best_nonnegative(summed, fit.source), nonnegative=False, max_iterations=3)
+    added = max(1, int(np.count_nonzero(summed.seen)) - int(np.count_nonzero(fit.coefficients)))
+    noise = free.objective / max(1, summed.observations - summed.size)
+    return (missed - free.objective) / added > _BEYOND * noise

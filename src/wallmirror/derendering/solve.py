@@ -149,7 +149,8 @@ def solve(
             # none beyond, a mismatch near rounding has to do.
             noise = expected_mismatch(problem, space, exact.closed)
             quiet = exact.closed.mismatch < _NOISELESS if math.isnan(noise) else noise < _SILENT
-            if method == "closed_form" or (quiet and exact.predicted_error <= _KNOWN):
+            certain = exact.predicted_error <= _KNOWN or exact.closed.near_solutions > 1  # or refused, with the reason
+            if method == "closed_form" or (quiet and certain):
                 estimate = exact
         if estimate is None:
             tell("maximum likelihood")
@@ -187,7 +188,8 @@ def _check_options(
                 "the poisson method needs the counts that a radiance of 1 makes", field="counts_per_radiance"
             )
     elif counts_per_radiance is not None or background != 0:
-        raise InputError("has a meaning for the poisson method alone", field="counts_per_radiance")
+        named = "background" if counts_per_radiance is None else "counts_per_radiance"
+        raise InputError("has a meaning for the poisson method alone; leave it out", field=named)
     if not 0 <= background < math.inf:
         raise InputError(f"is {background:g}; give mean counts >= 0", field="background")
     if seed < 0:
