@@ -77,7 +77,10 @@ def modes() -> tuple[Array, Array]:
     grid = grid_for(kernel, step=step, degree=3)
     dense = np.stack([t.toarray() for t in design_matrices(kernel, grid)])
     (m, p, k), b = dense.shape, s.source.shape[1]
-    r = grid.interpolate(BRDF.of_sum)
+    # The nearest spline in the mean square, by dense least squares on the samples that the forecast uses.
+    u = np.linspace(grid.start, grid.stop, 4 * grid.size)
+    basis = np.stack([grid.evaluate(row, u) for row in np.eye(grid.size)], axis=1)
+    r = np.linalg.lstsq(basis, BRDF.of_sum(u))[0]
     f = np.einsum("ipk,k->pi", dense, r)
     by_r = np.einsum("ipk,ib->pbk", dense, s.source, optimize=True).reshape(p * b, k)
     by_v = np.einsum("pi,bc->pbic", f, np.eye(b)).reshape(p * b, m * b)

@@ -103,7 +103,7 @@ def _search(problem: Problem, space: SignalSpace, step_deg: float | None) -> tup
                 break  # these fit whatever there is
             # Not the mismatch alone: a grid finer than the pixels fits anything, and its gap says so.
             other = at(step)
-            if other.closed.error > best.closed.error / 2:
+            if not other.closed.error < best.closed.error / 2:
                 others.append(other.closed)
                 if steps is COARSER_STEPS and best.closed.error > _WORTH_A_LOOK:
                     continue  # all knots so far are finer than the pixels

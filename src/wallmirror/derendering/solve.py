@@ -22,7 +22,7 @@ from wallmirror.derendering.problem import Problem, expected_mismatch, prepare
 from wallmirror.derendering.scarce import solve_scarce
 from wallmirror.derendering.solution import Gauge, Scale, Solution, conclude
 from wallmirror.derendering.subspace import SignalSpace
-from wallmirror.errors import InputError
+from wallmirror.errors import InputError, UndeterminedError
 
 Method = Literal["auto", "closed_form", "maximum_likelihood", "few_captures", "poisson"]
 
@@ -123,7 +123,8 @@ def solve(
     # The matrices are small: two BLAS threads that wait for each other are up to a hundred times slower than one.
     with threadpool_limits(limits=1, user_api="blas"):
         problem, space = prepare(captures, few_captures=few, weak_patterns=method != "closed_form")
-        estimate = None
+        estimate = exact = None
+        quiet = False
         if few:
             tell("search for few captures")
             support = None if support_deg is None else math.radians(support_deg)
@@ -149,12 +150,16 @@ def solve(
             # none beyond, a mismatch near rounding has to do.
             noise = expected_mismatch(problem, space, exact.closed)
             quiet = exact.closed.mismatch < _NOISELESS if math.isnan(noise) else noise < _SILENT
-            certain = exact.predicted_error <= _KNOWN or exact.closed.near_solutions > 1  # or refused, with the reason
-            if method == "closed_form" or (quiet and certain):
+            if method == "closed_form" or (quiet and exact.predicted_error <= _KNOWN):
                 estimate = exact
         if estimate is None:
             tell("maximum likelihood")
-            estimate = solve_noisy(problem, space, steps or NOISY_STEPS, nonnegative=nonnegative, tell=tell)
+            try:
+                estimate = solve_noisy(problem, space, steps or NOISY_STEPS, nonnegative=nonnegative, tell=tell)
+            except UndeterminedError:
+                if not quiet or exact is None:
+                    raise
+                estimate = exact  # refused below, and the closed form knows the better reason
         check = check_one_bounce(problem, estimate, wall_albedo=wall_albedo)
         return conclude(problem, space, estimate, check, gauge=gauge, seconds=lambda: time.perf_counter() - started)
 

@@ -82,7 +82,9 @@ class ClosedForm:
 
     @property
     def error(self) -> float:
-        """Bound on the relative error of V: the eigenvector turns by at most sqrt(mismatch) / gap (Davis, Kahan 1970)."""
+        """Bound on the relative error of r: the eigenvector turns by at most sqrt(mismatch) / gap (Davis, Kahan 1970)."""
+        if self.near_solutions > 1:
+            return math.inf
         return math.sqrt(self.mismatch) / max(self.gap, 1e-300) + 1e-15
 
 
