@@ -24,7 +24,7 @@ from wallmirror.pathtracing.rendering import Renderer, spread_seeds
 from wallmirror.report import FigureBlock, Section, TableBlock, Verdict, write_page
 from wallmirror.report.figures import radiance_maps, scene_plan, score_histogram
 from wallmirror.scene import Scene
-from wallmirror.transport import build_kernel, mirror_matrix, radiance
+from wallmirror.transport import Kernel, build_kernel, mirror_matrix, radiance
 
 Array = NDArray[np.float64]
 
@@ -186,10 +186,18 @@ def expect(
     observer = replace(scene.observer, view_angles=tuple(scene.observer.view_angles[v] for v in views))
     pattern = scene.source[:, realisation]
     brdf = wall_as_rendered(scene)
-    matrix = transport or physical_transport
+    kernels: dict[float, Kernel] = {}  # the templates share the scene's angular scale, and with it the kernel
 
     def analytic(model: BRDF) -> Array:
-        return radiance(matrix(observer, scene.card, model), pattern[:, None])[..., 0]
+        if transport is not None:
+            matrix = transport(observer, scene.card, model)
+        elif isinstance(model, Mirror):
+            matrix = mirror_matrix(observer, scene.card, model)
+        else:
+            scale = model.angular_scale
+            kernels[scale] = kernels.get(scale) or physical_kernel(observer, scene.card, scale)
+            matrix = kernels[scale].apply(model)
+        return radiance(matrix, pattern[:, None])[..., 0]
 
     if isinstance(brdf, Mirror):
         # Pixels that see a strip's border: there the share of the pixel, not the transport, is what is compared.
@@ -213,13 +221,18 @@ def judge(sample: Sample, expectation: Expectation) -> Comparison:
 
 
 def physical_transport(observer: Observer, card: Card, brdf: BRDF) -> Array:
-    """F to about 1e-5 of its peak and 3e-7 in the gain.
+    """F to about 1e-5 of its peak and 3e-7 in the gain."""
+    if isinstance(brdf, Mirror):
+        return mirror_matrix(observer, card, brdf)
+    return physical_kernel(observer, card, brdf.angular_scale).apply(brdf)
+
+
+def physical_kernel(observer: Observer, card: Card, angular_scale: float) -> Kernel:
+    """The kernel that `validate` compares with, for BRDFs of an angular scale in radians.
 
     The kinks of an interpolated table keep a quadrature from converging further, so no tolerance is pursued here.
     """
-    if isinstance(brdf, Mirror):
-        return mirror_matrix(observer, card, brdf)
-    return build_kernel(observer, card, resolution=brdf.angular_scale / 8, tolerance=1e-9).apply(brdf)
+    return build_kernel(observer, card, resolution=angular_scale / 8, tolerance=1e-9)
 
 
 def _behind_strips(observer: Observer, card: Card) -> NDArray[np.bool_]:
@@ -318,25 +331,38 @@ def verdict(result: Validation) -> Verdict:
 
 def section(result: Validation) -> Section:
     """The report's section on one scene: prose, plan, maps, numbers."""
-    scene, c = result.scene, result.comparison
+    scene = result.scene
     return Section(
         scene.title,
         (
             scene.about,
             verdict(result),
-            *((f"At one bounce this is {result.same_as}, and its render is shown.",) if result.same_as else ()),
             FigureBlock(
                 scene_plan(scene.observer, scene.card, half_width=scene.wall.half_width, room=scene.room),
                 "The scene from above, to scale.",
             ),
-            FigureBlock(
-                radiance_maps(result.reference, result.mean, c),
-                f"Views {', '.join(str(v + 1) for v in result.views)}: analytic and path-traced radiance on one scale, and "
-                "their difference in standard errors. Noise alone gives no structure.",
-            ),
-            *(() if c.exact else (FigureBlock(score_histogram(c), "The same differences against the normal curve."),)),
-            numbers(result),
+            *(_comparison(result) if not result.same_as else (_same(result),)),
         ),
+    )
+
+
+def _comparison(result: Validation) -> tuple[FigureBlock | TableBlock, ...]:
+    c = result.comparison
+    return (
+        FigureBlock(
+            radiance_maps(result.reference, result.mean, c),
+            f"Views {', '.join(str(v + 1) for v in result.views)}: analytic and path-traced radiance on one scale, and "
+            "their difference in standard errors. Noise alone gives no structure.",
+        ),
+        *(() if c.exact else (FigureBlock(score_histogram(c), "The same differences against the normal curve."),)),
+        numbers(result),
+    )
+
+
+def _same(result: Validation) -> str:
+    return (
+        f"Nothing that one bounce meets tells this scene from {result.same_as}, so that render, its maps and its numbers are "
+        "this scene's too. What further bounces add here, `wallmirror validate --bounces` measures."
     )
 
 
