@@ -4,9 +4,9 @@
 
 Mean square errors of pattern and BRDF, the thesis's measures, and relative errors after the best global scale against N,
 A, B, A x B, M, the lobes' width, the view angle, alpha and the share of B_diff that is kept: ten values of each, 96
-repetitions for `wallmirror.solve` and for Algorithm 3 (`de_render_unstructured`) with the text's alpha 0.1, and 32 for
+repetitions for `wallmirror.solve`, 32 for Algorithm 3 (`de_render_unstructured`) with the text's alpha 0.1, and 16 for
 the same with the recorded run's alpha 10. The solver has no alpha and no support, so it is not run against those.
-Captures that its closed form refuses are counted and shown as such; its search for few captures tries them 8 times.
+Captures that its closed form refuses are counted and shown as such; its search for few captures tries them 4 times.
 
 Every finished piece of work goes to a file of its cell at once (--work), so that a run that was stopped goes on where it
 stopped; when the code that made them changes, they count no more. A repetition has its own seed: neither the number of
@@ -48,7 +48,7 @@ from wallmirror.derendering.unstructured import de_render_unstructured
 HERE = Path(__file__).parent
 #: The methods, and how often each is run in a cell.
 EXACT, TEXT, RECORDED, FEW = "exact", "alpha 0.1", "alpha 10", "few captures"
-REPETITIONS = {EXACT: 96, TEXT: 96, RECORDED: 32, FEW: 8}
+REPETITIONS = {EXACT: 96, TEXT: 32, RECORDED: 16, FEW: 4}
 #: The closed form; the settings of the thesis's analysis (its alpha and tolerance, whole rows of B_diff) and of its
 #: recorded run; and what `solve` does by itself where the closed form refuses.
 OPTIONS: dict[str, dict[str, Any]] = {

@@ -292,6 +292,8 @@ def _extent_in_angle(observer: Observer, card: Card, half_pixel: float, half_str
 
     A chord from end to end would miss how u bends: under a near card it runs fast in the middle of a wide pixel.
     """
+    if half_pixel == 0 and half_strip == 0:
+        return 0.0, 0.0
     parts = np.linspace(-1.0, 1.0, _PARTS + 1)
     across = wall_points(observer, pixel_tangents(observer)[:, None] + half_pixel * parts)[..., None]
     strips = np.asarray(card.elements_x)

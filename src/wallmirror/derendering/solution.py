@@ -147,6 +147,8 @@ class Solution:
         What light beyond one bounce would do to this solution; None where nothing but the wall reflects.
     seconds:
         Time the solver took.
+    history:
+        What the solver did and why, a sentence for each stage.
     """
 
     status: str
@@ -174,6 +176,7 @@ class Solution:
     step_deg: float
     one_bounce: OneBounceCheck | None
     seconds: float
+    history: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, Any]:
         """Everything but the large arrays, ready for JSON (infinities and nan become null)."""
@@ -199,6 +202,7 @@ class Solution:
         return {
             **{k: _finite(v) for k, v in scalars.items()},
             "warnings": list(self.warnings),
+            "history": list(self.history),
             "one_bounce": None if self.one_bounce is None else asdict(self.one_bounce),
             "gauge": self.gauge,
             "priors": list(self.priors),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal, TypedDict, get_args
 
 from threadpoolctl import threadpool_limits
@@ -116,7 +117,13 @@ def solve(
     _check_options(method, few, support_deg, step_deg, counts_per_radiance, background, seed)
     gauge = Gauge(scale=scale, wall_albedo=wall_albedo, source_level=source_level)
     steps = (step_deg,) if step_deg else None
-    tell = progress or (lambda _: None)
+    history: list[str] = []
+
+    def tell(stage: str) -> None:
+        history.append(stage)
+        if progress is not None:
+            progress(stage)
+
     if method == "poisson":
         assert counts_per_radiance is not None
         captures = with_counting_noise(captures, per_radiance=counts_per_radiance, background=background)
@@ -126,7 +133,7 @@ def solve(
         estimate = exact = None
         quiet = False
         if few:
-            tell("search for few captures")
+            tell(f"{captures.realisations} captures for {captures.card.elements} elements: search for few captures")
             support = None if support_deg is None else math.radians(support_deg)
             estimate = solve_scarce(
                 problem, nonnegative=nonnegative, support=support, step_deg=step_deg, seed=seed, tell=tell
@@ -144,7 +151,7 @@ def solve(
                 tell=tell,
             )
         elif method == "closed_form" or (method == "auto" and _may_be_exact(problem, space)):
-            tell("closed form")
+            tell(f"rank {space.rank} of {captures.card.elements}, no noise stated: closed form")
             exact = solve_exactly(problem, space, step_deg=step_deg)
             # The singular values beyond M tell noise best: knots as fine as the pixels fit noise as well. Where there are
             # none beyond, a mismatch near rounding has to do.
@@ -152,6 +159,9 @@ def solve(
             quiet = exact.closed.mismatch < _NOISELESS if math.isnan(noise) else noise < _SILENT
             if method == "closed_form" or (quiet and exact.predicted_error <= _KNOWN):
                 estimate = exact
+            else:
+                why = "its error bound is too large" if quiet else "there is noise"
+                tell(f"closed form misses the data by {exact.closed.mismatch:.1e}: {why}")
         if estimate is None:
             tell("maximum likelihood")
             try:
@@ -161,7 +171,8 @@ def solve(
                     raise
                 estimate = exact  # refused below, and the closed form knows the better reason
         check = check_one_bounce(problem, estimate, wall_albedo=wall_albedo)
-        return conclude(problem, space, estimate, check, gauge=gauge, seconds=lambda: time.perf_counter() - started)
+        solution = conclude(problem, space, estimate, check, gauge=gauge, seconds=lambda: time.perf_counter() - started)
+        return replace(solution, history=tuple(history))
 
 
 def _may_be_exact(problem: Problem, space: SignalSpace) -> bool:
