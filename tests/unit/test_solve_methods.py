@@ -486,3 +486,14 @@ def test_where_rows_are_fewer_than_2m_they_bound_the_noise() -> None:
     between = np.full(4, 0.5 * (noise_edge(5, 9) + noise_edge(8, 9)))
     require_patterns(*synthetic(between, rows=5), 1.0)  # type: ignore[arg-type]
     assert_undetermined(lambda: require_patterns(*synthetic(between, rows=60), 1.0))  # type: ignore[arg-type]
+
+
+def test_history_says_what_was_done_and_why() -> None:
+    told: list[str] = []
+    solution = solve(gauged_captures(), progress=told.append)
+    assert solution.history == tuple(told)
+    assert "maximum likelihood" in solution.history
+    assert solution.summary()["history"] == told
+    quiet = gauged(noise=0.0)
+    assert "no noise stated: closed form" in quiet.history[0]
+    assert quiet.method == "closed_form"

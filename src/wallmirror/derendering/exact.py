@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 
 #: Knot spacings in degrees: the search begins with the first, goes through the others in turn while finer ones pay, and if
 #: none does, through coarser ones.
-EXACT_STEPS = (0.25, 0.125, 0.0625, 0.03125)
-COARSER_STEPS = (0.5, 1.0, 2.0, 4.0)
+EXACT_STEPS = (0.125, 0.0625, 0.03125)
+COARSER_STEPS = (0.25, 0.5, 1.0, 2.0, 4.0)
 _DEGREE = 7
 # At this mismatch rounding is all that is left: finer knots could only add to it.
 _EXACT = 3e-23
