@@ -67,30 +67,30 @@ def _pivot(h: Array, c: Array, upper: Array, x: Array) -> Array:
     at_zero, at_top = x <= 0, (x >= upper) & (upper > 0)
     fewest = np.full(len(c), h.shape[0] + 1)
     patience = np.full(len(c), _PATIENCE)
-    todo = np.arange(len(c))
+    unsolved = np.arange(len(c))
     identity = np.eye(h.shape[0])
     for _ in range(_MAX_PIVOTS):
-        low, high, top = at_zero[todo], at_top[todo], upper[todo]
+        low, high, top = at_zero[unsolved], at_top[unsolved], upper[unsolved]
         free = ~(low | high)
         held = np.where(high, top, 0.0)
         systems = np.where(free[:, :, None] & free[:, None, :], h, identity)
-        trial = np.linalg.solve(systems, np.where(free, c[todo] - held @ h, held)[..., None])[..., 0]
-        slope = trial @ h - c[todo]
+        trial = np.linalg.solve(systems, np.where(free, c[unsolved] - held @ h, held)[..., None])[..., 0]
+        slope = trial @ h - c[unsolved]
         below, above = free & (trial < -_EXACT), free & (trial > top + _EXACT)
         wrong = below | above | (low & (top > 0) & (slope < -_EXACT)) | (high & (slope > _EXACT))
         count = np.count_nonzero(wrong, axis=1)
-        x[todo] = np.clip(trial, 0.0, top)
+        x[unsolved] = np.clip(trial, 0.0, top)
 
-        better = count < fewest[todo]
-        fewest[todo] = np.where(better, count, fewest[todo])
-        patience[todo] = np.where(better, _PATIENCE, patience[todo] - 1)
-        single = patience[todo] < 0
+        better = count < fewest[unsolved]
+        fewest[unsolved] = np.where(better, count, fewest[unsolved])
+        patience[unsolved] = np.where(better, _PATIENCE, patience[unsolved] - 1)
+        single = patience[unsolved] < 0
         if np.any(single):
             last = h.shape[0] - 1 - np.argmax(wrong[:, ::-1], axis=1)
             wrong &= ~single[:, None] | (np.arange(h.shape[0]) == last[:, None])
-        at_zero[todo] = np.where(wrong, below, low)
-        at_top[todo] = np.where(wrong, above, high)
-        todo = todo[count > 0]
-        if todo.size == 0:
+        at_zero[unsolved] = np.where(wrong, below, low)
+        at_top[unsolved] = np.where(wrong, above, high)
+        unsolved = unsolved[count > 0]
+        if unsolved.size == 0:
             break
     return x

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from wallmirror.derendering.bounds import Bound, cramer_rao
 from wallmirror.derendering.estimate import Estimate, scale_free_error
 from wallmirror.derendering.likelihood import Fit, Moments, best_nonnegative, maximise, moments
-from wallmirror.derendering.problem import Problem, expected_mismatch, too_few_patterns
+from wallmirror.derendering.problem import Problem, expected_mismatch, reduced_misfit, too_few_patterns
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form, noise_edge
 from wallmirror.errors import UndeterminedError
@@ -85,10 +85,7 @@ def solve_noisy(
     grid, fit = level.grid, level.fit
     transport = np.stack([t @ fit.coefficients for t in level.designs], axis=1)
     stated = problem.noise_is_stated
-    weights = problem.inverse_variance if problem.inverse_variance is not None else np.ones(1)
-    counted = np.where(problem.noisy, weights * (problem.data - transport @ fit.source) ** 2, 0.0)
-    freedom = max(1, int(np.count_nonzero(problem.noisy)) - level.parameters - fit.source.size)
-    reduced = float(np.sum(counted)) / freedom
+    reduced = reduced_misfit(problem, transport, fit.source, level.parameters + fit.source.size)
     # Where the noise is stated, a misfit beyond it widens the bars; where it is not, the misfit is the noise.
     sigma = math.sqrt(max(1.0, reduced) if stated else reduced)
     require_patterns(problem, transport, fit.source, sigma)

@@ -207,3 +207,18 @@ def expected_mismatch(problem: Problem, space: SignalSpace, closed: ClosedForm) 
         return math.nan
     inverse = np.linalg.pinv(closed.source)
     return float(noise * (dimensions - elements) * np.sum(inverse**2) / np.sum(closed.transport**2))
+
+
+def reduced_misfit(problem: Problem, transport: Array, source: Array, parameters: int) -> float:
+    """Weighted squares of D - F V over the noisy pixels, per degree of freedom: 1 where model and stated noise are right.
+
+    Parameters
+    ----------
+    transport, source:
+        F (P, M) and V (M, B).
+    parameters:
+        Free numbers of the fit.
+    """
+    weights = problem.inverse_variance if problem.inverse_variance is not None else np.ones(1)
+    counted = np.where(problem.noisy, weights * (problem.data - transport @ source) ** 2, 0.0)
+    return float(np.sum(counted)) / max(1, int(np.count_nonzero(problem.noisy)) - parameters)

@@ -11,7 +11,7 @@ from wallmirror.derendering.bounds import cramer_rao
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.few_captures import STEPS, few_captures
 from wallmirror.derendering.likelihood import Fit, best_nonnegative, maximise, moments
-from wallmirror.derendering.problem import Problem
+from wallmirror.derendering.problem import Problem, reduced_misfit
 from wallmirror.derendering.splines import SplineGrid
 
 # A residual below this is a spline's own error or rounding, and no noise that a likelihood could weigh.
@@ -72,17 +72,15 @@ def solve_scarce(
     summed = moments(problem.data, designs, problem.inverse_variance)
     fit = maximise(summed, best_nonnegative(summed, found.source), nonnegative=nonnegative)
     transport = np.stack([t @ fit.coefficients for t in designs], axis=1)
-    weights = problem.inverse_variance if problem.inverse_variance is not None else np.ones(1)
-    missed = float(np.sum(np.where(problem.noisy, weights * (problem.data - transport @ fit.source) ** 2, 0.0)))
     unknowns = int(np.count_nonzero(fit.coefficients)) + fit.source.size
-    reduced = missed / max(1, int(np.count_nonzero(problem.noisy)) - unknowns)
+    reduced = reduced_misfit(problem, transport, fit.source, unknowns)
     stated = problem.noise_is_stated
     sigma = math.sqrt(max(1.0, reduced) if stated else reduced)
     peak_at = grid.peak(fit.coefficients, summed.exposure)
     bound = cramer_rao(summed, fit.coefficients, fit.source, gauge=grid.row(peak_at))
     if not fit.converged:
         warnings = ("the fit stopped before it converged, so the error bars may be too small",)
-    if support is not None and _reaches_beyond(problem, grid, fit, missed):
+    if support is not None and _reaches_beyond(problem, grid, fit):
         warnings += (
             f"the captures are explained far better by a BRDF that reaches beyond {math.degrees(support):g} deg, so the "
             "support that was named does not hold; the error bars do not know that",
@@ -107,11 +105,11 @@ def solve_scarce(
     )
 
 
-def _reaches_beyond(problem: Problem, grid: SplineGrid, fit: Fit, missed: float) -> bool:
+def _reaches_beyond(problem: Problem, grid: SplineGrid, fit: Fit) -> bool:
     """Whether the pattern that was found has a far smaller misfit once the BRDF may reach beyond its support."""
     _, designs = problem.designs(math.degrees(grid.step), degree=grid.degree, tolerance=1e-5)
     summed = moments(problem.data, designs, problem.inverse_variance)
     free = maximise(summed, best_nonnegative(summed, fit.source), nonnegative=False, max_iterations=3)
     added = max(1, int(np.count_nonzero(summed.seen)) - int(np.count_nonzero(fit.coefficients)))
     noise = free.objective / max(1, summed.observations - summed.size)
-    return (missed - free.objective) / added > _BEYOND * noise
+    return (fit.objective - free.objective) / added > _BEYOND * noise
