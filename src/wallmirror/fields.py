@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import importlib.resources
 import math
 import sys
 import tomllib
@@ -11,6 +12,32 @@ from pathlib import Path
 from typing import Any
 
 from wallmirror.errors import InputError
+
+
+def shipped_names(folder: str) -> tuple[str, ...]:
+    """Names of the TOML files that come with wallmirror in a folder of the package ("scenes"), sorted."""
+    return tuple(sorted(p.name.removesuffix(".toml") for p in _shipped(folder).iterdir() if p.name.endswith(".toml")))
+
+
+def named_toml(name_or_path: str | Path, folder: str, *, kind: str) -> Path:
+    """The path that was given, or that of the file with this name that comes with wallmirror.
+
+    Raises
+    ------
+    InputError
+        For a name that is not among them; `kind` says of what ("scene").
+    """
+    path = Path(name_or_path)
+    if path.suffix == ".toml":
+        return path
+    names = shipped_names(folder)
+    if str(name_or_path) not in names:
+        raise InputError(f'no {kind} is called "{name_or_path}"; give a .toml file or one of: {", ".join(names)}')
+    return _shipped(folder) / f"{name_or_path}.toml"
+
+
+def _shipped(folder: str) -> Path:
+    return Path(str(importlib.resources.files("wallmirror"))) / folder
 
 
 def read_toml(path: Path) -> Fields:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.resources
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from wallmirror.brdf import GaussianTrain
 from wallmirror.errors import InputError
-from wallmirror.fields import Fields, read_toml
+from wallmirror.fields import Fields, named_toml, read_toml, shipped_names
 from wallmirror.picture_scene import (
     BLACK,
     Background,
@@ -42,7 +41,7 @@ _LARGEST = 1e9
 
 def picture_names() -> tuple[str, ...]:
     """Names of the pictures that come with wallmirror, sorted."""
-    return tuple(sorted(p.name.removesuffix(".toml") for p in _shipped().iterdir() if p.name.endswith(".toml")))
+    return shipped_names("scenes/pictures")
 
 
 def load_picture(name_or_path: str | Path) -> PictureScene:
@@ -58,22 +57,12 @@ def load_picture(name_or_path: str | Path) -> PictureScene:
     >>> load_picture("thesis_box_mirror").shape("back wall").material
     Metal(colour=(0.8, 0.8, 0.8), roughness=0.0)
     """
-    path = Path(name_or_path)
-    if path.suffix != ".toml":
-        if str(name_or_path) not in picture_names():
-            raise InputError(
-                f'no picture is called "{name_or_path}"; give a .toml file or one of: {", ".join(picture_names())}'
-            )
-        path = _shipped() / f"{name_or_path}.toml"
+    path = named_toml(name_or_path, "scenes/pictures", kind="picture")
     root = read_toml(path)
     try:
         return _picture(root, name=path.stem)
     except InputError as error:
         raise error.located(file=path) from None
-
-
-def _shipped() -> Path:
-    return Path(str(importlib.resources.files("wallmirror") / "scenes" / "pictures"))
 
 
 def _picture(root: Fields, *, name: str) -> PictureScene:

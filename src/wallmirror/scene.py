@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.resources
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from wallmirror.brdf import BRDF, AngleSumBRDF, Diffuse, GaussianTrain, Mirror, Phong, Sum
 from wallmirror.errors import InputError
-from wallmirror.fields import Fields, read_toml
+from wallmirror.fields import Fields, named_toml, read_toml, shipped_names
 from wallmirror.geometry import Card, Observer, scan_angles, wall_points
 
 Array = NDArray[np.float64]
@@ -115,7 +114,7 @@ def _require_inside(room: Room, card: Card, observer: Observer) -> None:
 
 def scene_names() -> tuple[str, ...]:
     """Names of the scenes that come with wallmirror, sorted."""
-    return tuple(sorted(p.name.removesuffix(".toml") for p in _shipped().iterdir() if p.name.endswith(".toml")))
+    return shipped_names("scenes")
 
 
 def load_scene(name_or_path: str | Path) -> Scene:
@@ -131,22 +130,12 @@ def load_scene(name_or_path: str | Path) -> Scene:
     >>> load_scene("flat_wall_lobes").card.elements
     4
     """
-    path = Path(name_or_path)
-    if path.suffix != ".toml":
-        if str(name_or_path) not in scene_names():
-            raise InputError(
-                f'no scene is called "{name_or_path}"; give a .toml file or one of: {", ".join(scene_names())}'
-            )
-        path = Path(str(_shipped() / f"{name_or_path}.toml"))
+    path = named_toml(name_or_path, "scenes", kind="scene")
     root = read_toml(path)
     try:
         return _scene(root, name=path.stem)
     except InputError as error:
         raise error.located(file=path) from None
-
-
-def _shipped() -> Path:
-    return Path(str(importlib.resources.files("wallmirror") / "scenes"))
 
 
 def _scene(root: Fields, *, name: str) -> Scene:

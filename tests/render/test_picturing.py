@@ -108,7 +108,7 @@ def agreement(render, expected):
 
 
 @pytest.fixture(scope="module")
-def test_wall(mi):
+def wall_films(mi):
     scene = load_picture("thesis_test_wall")
     renderer = PictureRenderer(scene, width=WIDTH, height=HEIGHT, sampler="independent")
     return scene, renderer.render(2, spp=256, seeds=range(32))
@@ -119,16 +119,16 @@ def test_wall(mi):
 Z_LIMIT, RMS_LIMIT = 4.0, 1.15
 
 
-def test_the_card_through_the_lobes_is_the_sum_over_its_image(test_wall):
-    scene, render = test_wall
+def test_the_card_through_the_lobes_is_the_sum_over_its_image(wall_films):
+    scene, render = wall_films
     z, rms = agreement(render, radiance_by_quadrature(scene))
     assert z < Z_LIMIT
     assert 0.85 < rms < RMS_LIMIT
 
 
 @pytest.mark.parametrize("fault", [{"mirrored": True}, {"lobes_off": math.radians(0.5)}], ids=["mirrored", "turned"])
-def test_a_planted_fault_is_found(test_wall, fault):
-    scene, render = test_wall
+def test_a_planted_fault_is_found(wall_films, fault):
+    scene, render = wall_films
     assert agreement(render, radiance_by_quadrature(scene, **fault))[1] > 2 * RMS_LIMIT
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -56,10 +57,11 @@ class Level:
     def parameters(self) -> int:
         return int(np.count_nonzero(self.fit.coefficients))
 
-    @property
+    @cached_property
     def peak_at(self) -> float:
         return self.grid.peak(self.fit.coefficients, self.summed.exposure)
 
+    @cached_property
     def bound(self) -> Bound:
         gauge = self.grid.row(self.peak_at)
         return cramer_rao(self.summed, self.fit.coefficients, self.fit.source, gauge=gauge)
@@ -81,8 +83,8 @@ def solve_noisy(
         If fewer patterns than elements stand out of the noise, or no knots are coarse enough to be determined.
     """
     refined = refine(problem, space, steps, nonnegative=nonnegative, tell=tell)
-    level, bound, rival = refined.level, refined.bound, refined.rival
-    grid, fit = level.grid, level.fit
+    level, rival = refined.level, refined.rival
+    grid, fit, bound = level.grid, level.fit, level.bound
     transport = np.stack([t @ fit.coefficients for t in level.designs], axis=1)
     stated = problem.noise_is_stated
     reduced = reduced_misfit(problem, transport, fit.source, level.parameters + fit.source.size)
@@ -136,10 +138,9 @@ def solve_noisy(
 
 @dataclass(frozen=True)
 class Refined:
-    """The level that the data chose, its bound, and the fits on finer knots that did not pay and on the coarser before."""
+    """The level that the data chose, and the fits on finer knots that did not pay and on the coarser before."""
 
     level: Level
-    bound: Bound
     rival: Fit | None
     before: Fit | None
 
@@ -164,7 +165,7 @@ def refine(
                 raise
             levels, rival = [], None
         # Knots so fine that some cells are determined by nothing: those before them explain nearly as much.
-        while levels and not math.isfinite(levels[-1].bound().source_error):
+        while levels and not math.isfinite(levels[-1].bound.source_error):
             levels, rival = levels[:-1], None
         if levels or begin == 0:
             break
@@ -173,8 +174,7 @@ def refine(
         raise UndeterminedError(
             "the captures leave the pattern undetermined on the coarsest knots already; capture more light, views or patterns"
         )
-    bound = levels[-1].bound()
-    return Refined(levels[-1], bound, rival, levels[-2].fit if len(levels) > 1 else None)
+    return Refined(levels[-1], rival, levels[-2].fit if len(levels) > 1 else None)
 
 
 def _still_falls(refined: Refined) -> bool:

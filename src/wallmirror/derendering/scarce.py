@@ -47,7 +47,6 @@ def solve_scarce(
     grid = found.grid
     priors = [f"rho = 0 beyond {math.degrees(support):g} deg"] if support is not None else []
     priors += ["rho >= 0 and V >= 0"] if nonnegative else []
-    warnings: tuple[str, ...] = ()
     if found.residual < _NOISELESS and not problem.noise_is_stated:
         spread = np.full(found.source.shape, found.error * math.sqrt(float(np.mean(found.source**2))))
         peak_at = grid.peak(found.coefficients, found.exposure)
@@ -65,7 +64,7 @@ def solve_scarce(
             brdf_std=lambda u: np.full(u.shape, found.error * height),
             predicted_error=found.error,
             chi_squared=math.nan,
-            warnings=warnings,
+            warnings=(),
             priors=tuple(priors),
         )
     designs = found.designs
@@ -78,6 +77,7 @@ def solve_scarce(
     sigma = math.sqrt(max(1.0, reduced) if stated else reduced)
     peak_at = grid.peak(fit.coefficients, summed.exposure)
     bound = cramer_rao(summed, fit.coefficients, fit.source, gauge=grid.row(peak_at))
+    warnings: tuple[str, ...] = ()
     if not fit.converged:
         warnings = ("the fit stopped before it converged, so the error bars may be too small",)
     if support is not None and _reaches_beyond(problem, grid, fit):
