@@ -219,6 +219,25 @@ def solve(
     terminal.document(solved.summary())
 
 
+@app.command(epilog="Example: wallmirror figures 3.2 3.3 -o out/figures")
+def figures(
+    ids: Annotated[list[str] | None, typer.Argument(metavar="[ID]...", help="Such as 3.9; all if left out.")] = None,
+    out: Out = Path("out/figures"),
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Make the thesis's figures again, with the numbers behind them and what becomes of its claims."""
+    from wallmirror.jobs.figuring import make_figures
+
+    terminal = Terminal(as_json=as_json)
+    with terminal.progress("figures") as advance:
+        made = make_figures(ids or (), out, seed=seed, progress=advance)
+    for one in made:
+        terminal.say(f"{one.figure.id:<14}{one.figure.title}: {one.figure.line}")
+    terminal.say(f"open {out / 'gallery.html'}")
+    terminal.document({"figures": [one.summary() for one in made]})
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run a command and leave with its exit code; every foreseen failure is one sentence."""
     given = sys.argv[1:] if arguments is None else arguments

@@ -17,26 +17,10 @@ from numpy.typing import NDArray
 from wallmirror.comparison import Comparison
 from wallmirror.derendering.solution import Solution
 from wallmirror.geometry import Card, Observer
+from wallmirror.report.style import FAINT, INK, OURS, PALE, TRUTH, WARM, clean, new_figure
 from wallmirror.scene import Room
 
 Array = NDArray[np.float64]
-
-INK = "#22272e"
-FAINT = "#8b949e"
-TRUTH = "#22272e"
-OURS = "#1664c0"
-WARM = "#c8501e"
-_CYCLE = ("#1664c0", "#c8501e", "#2e8b57", "#8250b4")
-
-
-def _figure(width: float, height: float) -> Figure:
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def _clean(axes: Axes) -> None:
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(FAINT)
-    axes.tick_params(colors=INK, labelsize=9)
 
 
 def embed(figure: Figure) -> str:
@@ -54,7 +38,7 @@ def scene_plan(observer: Observer, card: Card, *, half_width: float, room: Room 
     corners = [[x_o + y_o * math.tan(angle + side * half) for side in (1, -1)] for angle in observer.view_angles]
     reach = float(np.max(np.abs(corners)))
     depth = max(room.depth if room else 0.0, -y_o, -card.y)
-    figure = _figure(7.2, min(6.5, 1.1 + 6.0 * (1.2 * depth) / (2.4 * reach)))
+    figure = new_figure(7.2, min(6.5, 1.1 + 6.0 * (1.2 * depth) / (2.4 * reach)))
     axes = figure.add_subplot()
     axes.add_patch(
         Polygon([(x_o, y_o), (np.min(corners), 0), (np.max(corners), 0)], color=OURS, alpha=0.10, linewidth=0)
@@ -96,14 +80,14 @@ def scene_plan(observer: Observer, card: Card, *, half_width: float, room: Room 
     axes.set_ylabel("y (m)")
     lowest = -room.depth if room else min(y_o, card.y)
     axes.set_ylim(lowest - 0.08 * span, 0.13 * span)
-    _clean(axes)
+    clean(axes)
     return figure
 
 
 def photograph(image: Array, *, caption: str = "") -> Figure:
     """A 2-D render with the tone curve of a display (sRGB); the brightest half per cent is clipped."""
     height, width = image.shape[:2]
-    figure = _figure(7.2, 7.2 * height / width)
+    figure = new_figure(7.2, 7.2 * height / width)
     _show(figure.add_subplot(), image, float(np.quantile(image, 0.995)), caption)
     return figure
 
@@ -111,7 +95,7 @@ def photograph(image: Array, *, caption: str = "") -> Figure:
 def one_tone(images: tuple[Array, ...], captions: tuple[str, ...]) -> Figure:
     """Renders of one size side by side, in one tone scale set by the last, so that they can be compared by eye."""
     height, width = images[0].shape[:2]
-    figure = _figure(10.5, 10.5 / len(images) * height / width + 0.3)
+    figure = new_figure(10.5, 10.5 / len(images) * height / width + 0.3)
     white = float(np.quantile(images[-1], 0.98))
     for axes, image, caption in zip(figure.subplots(1, len(images)), images, captions, strict=True):
         _show(axes, image, white, caption)
@@ -129,7 +113,7 @@ def _show(axes: Axes, image: Array, white: float, caption: str) -> None:
 
 def radiance_maps(reference: Array, mean: Array, comparison: Comparison, *, unit: str = "") -> Figure:
     """Analytic picture, path-traced picture and their difference in standard errors, views over pixels."""
-    figure = _figure(10.5, 3.1)
+    figure = new_figure(10.5, 3.1)
     panels = figure.subplots(1, 3, sharey=True)
     top = float(np.quantile(reference, 0.999)) or 1.0
     extent = (0.5, reference.shape[1] + 0.5, reference.shape[0] + 0.5, 0.5)
@@ -139,7 +123,7 @@ def radiance_maps(reference: Array, mean: Array, comparison: Comparison, *, unit
         axes.set_title(title, fontsize=10)
     figure.colorbar(shown, ax=panels[:2], label=f"radiance{unit}", pad=0.01)
     left_out = panels[2]
-    left_out.set_facecolor("#d0d7de")
+    left_out.set_facecolor(PALE)
     z = left_out.imshow(comparison.z, aspect="auto", cmap="RdBu_r", vmin=-4, vmax=4, extent=extent,
                         interpolation="nearest")  # fmt: skip
     left_out.set_title("difference (grey: left out)", fontsize=10)
@@ -154,7 +138,7 @@ def radiance_maps(reference: Array, mean: Array, comparison: Comparison, *, unit
 
 def score_histogram(comparison: Comparison) -> Figure:
     """Histogram of the z scores over the normal density that noise alone would give."""
-    figure = _figure(4.6, 2.9)
+    figure = new_figure(4.6, 2.9)
     axes = figure.add_subplot()
     z = comparison.z[np.isfinite(comparison.z)]
     edges = np.linspace(-5, 5, 51)
@@ -164,7 +148,7 @@ def score_histogram(comparison: Comparison) -> Figure:
     axes.set_xlabel("difference (standard errors)")
     axes.set_yticks([])
     axes.legend(frameon=False, fontsize=9)
-    _clean(axes)
+    clean(axes)
     return figure
 
 
@@ -174,7 +158,7 @@ def recovered_source(solution: Solution, truth: Array | None = None) -> Figure:
     shown = min(realisations, 8)
     columns = min(shown, 4)
     rows = math.ceil(shown / columns)
-    figure = _figure(10.5, 2.3 * rows + 0.3)
+    figure = new_figure(10.5, 2.3 * rows + 0.3)
     panels = np.atleast_1d(figure.subplots(rows, columns, sharey=True, sharex=True, squeeze=False)).ravel()
     scale = 1.0
     if truth is not None:
@@ -186,14 +170,14 @@ def recovered_source(solution: Solution, truth: Array | None = None) -> Figure:
             axes.set_axis_off()
             continue
         if truth is not None:
-            axes.bar(place, truth[:, b] / top, width=0.72, color="#d0d7de", label="true")
+            axes.bar(place, truth[:, b] / top, width=0.72, color=PALE, label="true")
         axes.errorbar(
             place, scale * solution.source[:, b] / top, yerr=2 * scale * solution.shape_std[:, b] / top,
             fmt="o", color=OURS, markersize=5, capsize=4, label="recovered (±2 σ)",
         )  # fmt: skip
         axes.set_title(f"pattern {b + 1}", fontsize=10)
         axes.set_xticks(place if elements <= 12 else place[:: elements // 8])
-        _clean(axes)
+        clean(axes)
     panels[0].set_ylim(0, 1.18)
     panels[0].set_ylabel("radiance / brightest")
     panels[0].legend(frameon=False, fontsize=8, loc="upper right")
@@ -207,25 +191,25 @@ def source_deviations(solution: Solution, truth: Array) -> Figure:
     top = float(np.max(truth)) / 100
     deviation = (scale * solution.source - truth).T.ravel() / top
     bars = 2 * scale * solution.shape_std.T.ravel() / top
-    figure = _figure(10.5, 2.2)
+    figure = new_figure(10.5, 2.2)
     axes = figure.add_subplot()
     axes.axhline(0, color=INK, linewidth=0.8)
     place = np.arange(deviation.size)
     axes.errorbar(place, deviation, yerr=bars, fmt="o", color=OURS, markersize=4, capsize=3)
     elements = truth.shape[0]
     for b in range(1, truth.shape[1]):
-        axes.axvline(b * elements - 0.5, color="#d0d7de", linewidth=0.8)
+        axes.axvline(b * elements - 0.5, color=PALE, linewidth=0.8)
     axes.set_xticks(
         (np.arange(truth.shape[1]) + 0.5) * elements - 0.5, [f"pattern {b + 1}" for b in range(truth.shape[1])]
     )
     axes.set_ylabel("off by (% of brightest)")
-    _clean(axes)
+    clean(axes)
     return figure
 
 
 def recovered_brdf(solution: Solution, truth: Array | None = None) -> Figure:
     """The BRDF over the angle sum with its 2-sigma band; `truth` is on the solution's own nodes."""
-    figure = _figure(10.5, 3.2)
+    figure = new_figure(10.5, 3.2)
     axes = figure.add_subplot()
     u = np.degrees(solution.angle_sum)
     seen = np.isfinite(solution.brdf_std) & (solution.brdf_std < 0.5)
@@ -242,13 +226,13 @@ def recovered_brdf(solution: Solution, truth: Array | None = None) -> Figure:
     axes.set_xlabel("angle sum θs + θo (degrees); 0 is the mirror direction")
     axes.set_ylabel("BRDF / peak")
     axes.legend(frameon=False, fontsize=9, ncols=3, loc="upper right")
-    _clean(axes)
+    clean(axes)
     return figure
 
 
 def error_bars(rows: list[tuple[str, float, float]]) -> Figure:
     """Measured error beside predicted error of the pattern for several solutions, on a log axis."""
-    figure = _figure(7.2, 0.55 * len(rows) + 1.4)
+    figure = new_figure(7.2, 0.55 * len(rows) + 1.4)
     axes = figure.add_subplot()
     place = np.arange(len(rows))[::-1]
     axes.barh(place + 0.18, [100 * r[1] for r in rows], height=0.34, color=OURS, label="measured")
@@ -262,5 +246,5 @@ def error_bars(rows: list[tuple[str, float, float]]) -> Figure:
     axes.xaxis.set_minor_locator(NullLocator())
     axes.set_xlabel("error of the pattern (%)")
     figure.legend(frameon=False, fontsize=9, loc="outside upper right", ncols=2)
-    _clean(axes)
+    clean(axes)
     return figure
