@@ -227,7 +227,7 @@ def figures(
     as_json: AsJson = False,
 ) -> None:
     """Make the thesis's figures again, with the numbers behind them and what becomes of its claims."""
-    from wallmirror.jobs.figuring import make_figures
+    from wallmirror.thesis import make_figures
 
     terminal = Terminal(as_json=as_json)
     with terminal.progress("figures") as advance:

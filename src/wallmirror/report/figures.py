@@ -102,6 +102,15 @@ def one_tone(images: tuple[Array, ...], captions: tuple[str, ...]) -> Figure:
     return figure
 
 
+def pictures(images: tuple[Array, ...], captions: tuple[str, ...]) -> Figure:
+    """Renders side by side, grey (height, width) or in colour (height, width, 3), white at 1."""
+    height, width = images[0].shape[:2]
+    figure = new_figure(5.2 * len(images), 5.2 * height / width + 0.3)
+    for axes, image, caption in zip(figure.subplots(1, len(images), squeeze=False)[0], images, captions, strict=True):
+        _show(axes, image, 1.0, caption)
+    return figure
+
+
 def _show(axes: Axes, image: Array, white: float, caption: str) -> None:
     tone = np.clip(image / (white or 1.0), 0, 1)
     tone = np.where(tone <= 0.0031308, 12.92 * tone, 1.055 * np.power(tone, 1 / 2.4) - 0.055)

@@ -10,7 +10,10 @@ from wallmirror.thesis.figure import ThesisFigure
 
 # Modules of this package by section. Each has FIGURES: dict[str, Callable[[int], ThesisFigure]], from a figure's id to
 # the function that makes it from a seed.
-_MODULES = ("algorithm_1",)
+_MODULES = (
+    "algorithm_1",
+    "pictures",
+)
 
 
 def figure_ids() -> tuple[str, ...]:

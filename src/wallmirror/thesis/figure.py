@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike
 
 from wallmirror.errors import InputError
 
-#: What measurement makes of a claim: it holds, it holds with a change that is named, it does not hold.
-Outcome = Literal["confirmed", "corrected", "refuted"]
+#: What measurement makes of a claim: it holds, it holds with a change that is named, it does not hold, or the run was too
+#: short to tell.
+Outcome = Literal["confirmed", "corrected", "refuted", "undecided"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +30,7 @@ class Claim:
     thesis:
         The claim in a sentence of our own.
     outcome:
-        "confirmed", "corrected" or "refuted", computed from the numbers and never written down beforehand.
+        "confirmed", "corrected", "refuted" or "undecided", computed from the numbers and never written down beforehand.
     measured:
         A sentence with the numbers that decide.
     """
@@ -78,8 +79,8 @@ class ThesisFigure:
             if np.ndim(column) != 1:
                 raise InputError(f"has shape {np.shape(column)}; give one dimension", field=f"{self.id}.{name}")
         for name, number in self.numbers.items():
-            if math.isnan(number):
-                raise InputError("is not a number", field=f"{self.id}.{name}")
+            if not math.isfinite(number):
+                raise InputError(f"is {number}; give a finite number", field=f"{self.id}.{name}")
 
     @property
     def line(self) -> str:

@@ -8,13 +8,13 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from wallmirror.console import Advance
 from wallmirror.files import write_atomically
 from wallmirror.report import FigureBlock, Section, TableBlock, Verdict, write_page
-from wallmirror.thesis import ThesisFigure, figure_ids, make_figure
-from wallmirror.thesis.catalogue import require_figure
+from wallmirror.thesis.catalogue import figure_ids, make_figure, require_figure
+from wallmirror.thesis.figure import Outcome, ThesisFigure
 
 _LEAD = (
     "Every figure of chapters 1 to 3 of the thesis, computed again, with the numbers behind it and what they make of the "
@@ -78,10 +78,12 @@ def write_gallery(made: Sequence[Made], path: Path) -> None:
     """The page with every figure, its numbers, and the thesis's claims beside the measured ones."""
     claims = [(m.figure, claim) for m in made for claim in m.figure.claims]
     counted = Counter(claim.outcome for _, claim in claims)
-    verdicts = [
-        Verdict(None, f"Of {len(claims)} claims {counted['confirmed']} are confirmed, {counted['corrected']} corrected "
-                      f"and {counted['refuted']} refuted.")
-    ] if claims else []  # fmt: skip
+    told = ", ".join(f"{counted[outcome]} {outcome}" for outcome in get_args(Outcome) if counted[outcome])
+    verdicts = (
+        [Verdict(None, f"{len(claims)} claim{'s' if len(claims) != 1 else ''} of the thesis: {told}.")]
+        if claims
+        else []
+    )
     table = TableBlock(
         ("figure", "the thesis", "verdict", "measured"),
         tuple((figure.id, claim.thesis, claim.outcome, claim.measured) for figure, claim in claims),
@@ -91,10 +93,12 @@ def write_gallery(made: Sequence[Made], path: Path) -> None:
     write_page(path, title="The thesis's figures, made again", lead=_LEAD, verdicts=verdicts, sections=sections)
 
 
-def _blocks(made: Made) -> tuple[str | FigureBlock | Verdict, ...]:
+def _blocks(made: Made) -> tuple[str | FigureBlock | TableBlock | Verdict, ...]:
     figure = made.figure
-    good = {"confirmed": True, "corrected": None, "refuted": False}
+    good = {"confirmed": True, "corrected": None, "refuted": False, "undecided": None}
+    numbers = tuple((name, f"{number:.4g}") for name, number in figure.numbers.items())
     return (
-        FigureBlock(figure.figure, f"{figure.about} ({figure.line})"),
+        FigureBlock(figure.figure, figure.about),
+        *([TableBlock(("measured", ""), numbers)] if numbers else []),
         *(Verdict(good[c.outcome], f"{c.outcome.capitalize()}: {c.thesis} {c.measured}") for c in figure.claims),
     )
