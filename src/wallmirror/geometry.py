@@ -18,6 +18,9 @@ from wallmirror.errors import InputError
 
 Array = NDArray[np.float64]
 
+# Lengths in metres beyond which squares and cubes of them would leave the range of float64.
+_SHORTEST, _LONGEST = 1e-100, 1e100
+
 #: Where the samples of a view lie: the centres of finite pixels, or points from edge to edge of the field.
 PixelPlacement = Literal["centres", "edges"]
 
@@ -59,6 +62,7 @@ class Observer:
                 f"the observer stands on or behind the wall (y = {self.position[1]:g}); give y < 0",
                 field="observer.position",
             )
+        _require_lengths("observer.position", self.position[:1], distance=self.distance)
         if not 0 < self.fov < math.pi:
             raise InputError(
                 f"a field of view of {math.degrees(self.fov):g} deg is not between 0 and 180",
@@ -124,10 +128,14 @@ class Card:
             raise InputError("names no element; give at least one position", field="card.elements_x")
         if self.y >= 0:
             raise InputError(f"the card lies on or behind the wall (y = {self.y:g}); give y < 0", field="card.y")
+        _require_lengths("card.elements_x", self.elements_x)
+        _require_lengths("card.y", distance=self.distance)
         for name in ("element_width", "element_height", "board_width", "board_height"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise InputError(f"is {value:g}; give a length >= 0 in metres", field=f"card.{name}")
+            if not 0 <= value <= _LONGEST:
+                raise InputError(
+                    f"is {value:g}; give a length >= 0 in metres, up to {_LONGEST:g}", field=f"card.{name}"
+                )
         if (self.element_width == 0) != (self.element_height == 0):
             raise InputError(
                 "strips need both a width and a height; give both, or 0 for both (points)",
@@ -238,3 +246,9 @@ def require_finite(field: str, values: tuple[float, ...]) -> None:
     for value in values:
         if not math.isfinite(value):
             raise InputError(f"holds {value}; give finite numbers", field=field)
+
+
+def _require_lengths(field: str, places: tuple[float, ...] = (), *, distance: float = 1.0) -> None:
+    """Refuse places and distances whose squares and cubes float64 cannot hold."""
+    if not _SHORTEST <= distance <= _LONGEST or any(abs(place) > _LONGEST for place in places):
+        raise InputError(f"holds a length beyond {_SHORTEST:g} to {_LONGEST:g} metres; use other units", field=field)

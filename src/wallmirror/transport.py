@@ -248,7 +248,10 @@ def strip_factor(distance: float, dx: ArrayLike, low: ArrayLike, high: ArrayLike
     def antiderivative(h: ArrayLike) -> Array:
         # In units of a, so that neither tiny nor huge scenes leave the range of float64.
         h = np.asarray(h, dtype=np.float64) / a
-        return 0.5 * (distance / a) ** 2 / a * (h / (1 + h * h) + np.arctan(h))
+        far = np.abs(h) > 1e8  # h / (1 + h^2) is 1 / h to rounding, and h^2 may overflow
+        ratio = np.where(far, 1 / np.where(far, h, 1.0), h / (1 + np.where(far, 0.0, h) ** 2))
+        whole: Array = 0.5 * (distance / a) ** 2 / a * (ratio + np.arctan(h))
+        return whole
 
     return antiderivative(high) - antiderivative(low)
 
@@ -345,11 +348,12 @@ def _mean_strip_factor(distance: float, dx: Array, half: float, reach: Array) ->
     """Mean of `strip_factor` over wall points from -reach to reach below a strip from -half to half, in 1/m.
 
     With G(h) = z^2 h atan(h / a) / (2 a^3), whose derivative is the antiderivative of `strip_factor`, the mean is
-    [G(half + reach) - G(half - reach)] / reach; the difference of the arctangents is taken as one.
+    [G(half + reach) - G(half - reach)] / reach; sum and difference of the arctangents are taken as one each, since both
+    may cancel.
     """
     a = np.hypot(distance, dx)
     upper, lower = (half + reach) / a, (half - reach) / a
-    both = np.arctan(upper) + np.arctan(lower)
+    both = np.arctan2(2 * half / a, 1 - upper * lower)
     with np.errstate(invalid="ignore"):
         apart = np.arctan2(2 * reach / a, 1 + upper * lower) / np.where(reach > 0, reach, 1.0)
     apart = np.where(reach > 0, apart, 2 * a / (a * a + half * half))

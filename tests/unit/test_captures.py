@@ -535,7 +535,7 @@ def test_angles_of_every_scene_come_back(tmp_path: Path) -> None:
 
 
 def test_awkward_numbers_come_back(tmp_path: Path) -> None:
-    card = Card(elements_x=(-1e16, 5e-324, 0.1 + 0.2), y=-1e-300)
+    card = Card(elements_x=(-1e16, 5e-324, 0.1 + 0.2), y=-1e-99)
     write_captures(tmp_path / "set", sample_set(card=card))
     assert read_captures(tmp_path / "set").card == card
 

@@ -60,6 +60,10 @@ def scale_free_error(estimate: Array, truth: Array) -> float:
     >>> scale_free_error(np.array([2.0, 4.0]), np.array([1.0, 2.0]))
     0.0
     """
-    power = float(np.sum(estimate * estimate))
-    scale = float(np.sum(estimate * truth)) / power if power > 0 else 0.0
-    return float(np.linalg.norm(scale * estimate - truth) / np.linalg.norm(truth))
+    # In units of the largest entry each, so that squares neither overflow nor vanish.
+    found, sought = (
+        np.asarray(values) / (float(np.max(np.abs(values), initial=0.0)) or 1.0) for values in (estimate, truth)
+    )
+    power = float(np.sum(found * found))
+    scale = float(np.sum(found * sought)) / power if power > 0 else 0.0
+    return float(np.linalg.norm(scale * found - sought) / np.linalg.norm(sought))

@@ -100,6 +100,11 @@ def foresee(
         raise InputError("holds a standard deviation that is not positive and finite", field="noise")
     if step_deg is not None and not 0.001 <= step_deg <= 45:
         raise InputError(f"is {step_deg:g}; give a knot spacing from 0.001 to 45 degrees", field="step_deg")
+    # The bound is proportional to the noise, so that it is found for patterns and noise of order one.
+    brightest, level = float(np.abs(source).max()), float(spread.max())
+    source, spread = source / brightest, spread / level
+    with np.errstate(over="ignore"):
+        ratio = float(np.float64(level) / brightest)
     step = step_deg or min(_COARSEST_DEG, max(_FINEST_DEG, math.degrees(brdf.angular_scale) / 2))
     with threadpool_limits(limits=1, user_api="blas"):
         kernel = build_kernel(observer, card, weights=weights, resolution=2 * math.radians(step), tolerance=1e-5)
@@ -121,12 +126,12 @@ def foresee(
         spilt = float(np.sum(gram * bound.coefficients)) - float(along @ bound.coefficients @ along) / power
         _, normal, _ = information(summed, coefficients, source)
         known = math.sqrt(float(np.einsum("bii->", normal)) / float(np.sum(source**2)))
-    transport_error = math.sqrt(max(0.0, spilt) / power)
+    transport_error = ratio * math.sqrt(max(0.0, spilt) / power)
     return Forecast(
-        source_error=bound.source_error,
+        source_error=ratio * bound.source_error,
         transport_error=transport_error if math.isfinite(bound.source_error) else math.inf,
-        shape_std=bound.shape_std,
-        known_brdf_error=known,
+        shape_std=level * bound.shape_std,
+        known_brdf_error=ratio * known,
         step_deg=step,
     )
 

@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 # Variances below this share of the largest are raised to it: a pixel that saw no noise by luck must not outweigh
 # all others, and no spline follows a lobe's tail to better than about a hundredth of the noise at its peak.
 _VARIANCE_FLOOR = 1e-4
+# Variances in units of the brightest pixel's square: below the first there is only rounding, beyond the second no light.
+_SILENT, _DROWNED = 1e-32, 1e60
 # Knot spacings in degrees of the BRDFs into whose span noisy captures are projected, the most faithful first.
 _PROJECTION_STEPS = (1.0, 2.0, 4.0)
 # Noise below this share of the films is none that a projection could be sure of taking away.
@@ -132,12 +134,16 @@ def prepare(
             f"{views * pixels} pixel(s) cannot determine {elements} elements and a BRDF; use more pixels or views"
         )
     data = captures.radiance.reshape(views * pixels, realisations)
-    scale = float(np.abs(data).max(initial=0.0))
+    # What a saturated pixel holds tells nothing, of the scale neither.
+    counts = True if captures.variance is None else np.isfinite(captures.variance).reshape(data.shape)
+    if not np.any(counts):
+        raise UndeterminedError("every pixel is saturated; expose for less time and capture again")
+    scale = float(np.abs(data).max(initial=0.0, where=counts))
     if scale == 0:
         raise UndeterminedError("every capture is dark; light the card and capture again")
     inverse, noisy = None, np.ones(data.shape, dtype=bool)
     if captures.variance is not None:
-        inverse, noisy = _inverse_variance(captures.variance.reshape(data.shape) / scale / scale)
+        inverse, noisy = _inverse_variance(captures.variance.reshape(data.shape), scale)
         if captures.variance_is_floor:
             # Rounding is known, the noise above it is not: all pixels alike, the saturated ones out.
             inverse = None if np.all(inverse > 0) else (inverse > 0).astype(np.float64)
@@ -148,11 +154,13 @@ def prepare(
     return problem, _signal_space(problem, weak_patterns=weak_patterns)
 
 
-def _inverse_variance(variance: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _inverse_variance(variance: Array, scale: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Weights of the pixels in units of the scale, and which of them stated their noise."""
     finite = np.isfinite(variance)
-    if not finite.any():
-        raise UndeterminedError("every pixel is saturated; expose for less time and capture again")
-    floor = _VARIANCE_FLOOR * float(variance[finite].max()) or 1.0
+    with np.errstate(over="ignore"):
+        variance = np.minimum(variance / scale / scale, _DROWNED)
+    largest = float(variance[finite].max())
+    floor = _VARIANCE_FLOOR * largest if largest > _SILENT else 1.0
     return np.where(finite, 1.0 / np.maximum(variance, floor), 0.0), finite & (variance > floor)
 
 
