@@ -13,6 +13,8 @@ from wallmirror.thesis.figure import ThesisFigure
 _MODULES = (
     "algorithm_1",
     "pictures",
+    "rendering_as_convolution",
+    "far_field",
 )
 
 
