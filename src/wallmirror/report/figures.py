@@ -73,7 +73,11 @@ def scene_plan(observer: Observer, card: Card, *, half_width: float, room: Room 
     axes.annotate("wall", (0, 0.025 * span), (0, 4), ha="center", **label)
     axes.annotate(f"hidden card, {card.elements} elements", (max(card.elements_x), card.y), (9, -3), ha="left", **label)
     axes.annotate(
-        f"camera, {observer.views} views of {math.degrees(observer.fov):.0f}°", (x_o, y_o), (10, -4), ha="left", **label
+        f"camera, {observer.views} view{'s' * (observer.views > 1)} of {math.degrees(observer.fov):.0f}°",
+        (x_o, y_o),
+        (10, -4),
+        ha="left",
+        **label,
     )
     axes.set_aspect("equal")
     axes.set_xlabel("x (m)")

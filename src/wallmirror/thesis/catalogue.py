@@ -11,6 +11,7 @@ from wallmirror.thesis.figure import ThesisFigure
 # Modules of this package by section. Each has FIGURES: dict[str, Callable[[int], ThesisFigure]], from a figure's id to
 # the function that makes it from a seed.
 _MODULES = (
+    "geometry_diagrams",
     "algorithm_1",
     "pictures",
     "rendering_as_convolution",

@@ -203,8 +203,8 @@ def far_enough(seed: int) -> ThesisFigure:
                 outcome="confirmed" if min(similar) > _CLOSE else "refuted",
                 measured=f"The relative error is {thesis[0]:.2f} (two lobes) and {thesis[1]:.2f} (four), the correlation "
                 f"{similar[0]:.2f} and {similar[1]:.2f}: the lobes at 30° land {off:.2f} and {inner:.2f} m off, at least "
-                f"{off / width:.1f} of their standard deviations. The holes are not the cause (without: {filled:.2f}). Over the "
-                f"angle sum the errors are {ours[0]:.3f} and {ours[1]:.3f}.",
+                f"{off / width:.1f} of their standard deviations. The holes are not the cause (without: {filled:.2f}). Over "
+                f"the angle sum the errors are {ours[0]:.3f} and {ours[1]:.3f}.",
             ),
         ),
     )
