@@ -233,7 +233,7 @@ def figures(
     with terminal.progress("figures") as advance:
         made = make_figures(ids or (), out, seed=seed, progress=advance)
     for one in made:
-        terminal.say(f"{one.figure.id:<14}{one.figure.title}: {one.figure.line}")
+        terminal.say(f"{one.figure.id:<18}{one.figure.title}: {one.figure.line}")
     terminal.say(f"open {out / 'gallery.html'}")
     terminal.document({"figures": [one.summary() for one in made]})
 

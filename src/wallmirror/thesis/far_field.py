@@ -163,7 +163,8 @@ def far_field(seed: int) -> ThesisFigure:
                 thesis="A narrower source makes the far-field approximation better, as a greater distance does.",
                 outcome="confirmed" if small < 0.1 else "corrected",
                 measured=f"Over the angle sum it does ({small_ours:.1g} for a card 5 cm wide at 50 m). Along the wall it "
-                f"stays at {small:.2f}, because the projection of the BRDF leaves out the distance of the card.",
+                f"stays at {small:.2f}, because the projection of the BRDF leaves out the distance of the card; with both "
+                f"distances at {float(by_width['wall, both distances'][0]):.2f}, because tangents do not add.",
             ),
         ),
     )
