@@ -25,8 +25,10 @@ import mpmath
 import numpy as np
 
 import wallmirror as wm
+from wallmirror.convolution import angle_convolution, spherical_convolution
 from wallmirror.files import write_atomically
 from wallmirror.geometry import incident_angles, pixel_half_width, pixel_tangents
+from wallmirror.jobs.validating import validate_scene
 from wallmirror.transport import quadrature_order, strip_factor
 
 HERE = Path(__file__).parent
@@ -434,12 +436,105 @@ def invariance_cases() -> Iterator[Case]:
         yield Case("solve", f"order of {kind}", "the same", lambda k=kind: shuffled(k))
 
 
+# -- convolutions -----------------------------------------------------------------------------------------------
+
+
+def convolution_cases() -> Iterator[Case]:
+    """The half circle against Algorithm 1: it needs Hypothesis 8 alone, so that only its sampling may be off."""
+    forms = {"spherical_convolution": spherical_convolution, "angle_convolution": angle_convolution}
+
+    def each(quantity: str, value: str, form: str, allowed: float, **changes: Any) -> Case:
+        def check() -> tuple[float, float]:
+            options = dict(changes)
+            eye = options.pop("observer", observer(pixels_at="edges"))
+            strips = options.pop("card", card(element_width=0.0, element_height=0.0))
+            brdf = options.pop("brdf", lobes())
+            source = np.random.default_rng(5).random(strips.elements)
+            exact = wm.radiance(wm.transport_matrix(eye, strips, brdf, weights="thesis"), source)
+            found = forms[form](eye, strips, brdf, source, order=5, **options)
+            # Relative to the lobe's peak, 1: where only its far tail is seen, the tail is not resolved.
+            return float(np.max(np.abs(found - exact)) / max(1.0, np.max(np.abs(exact)))), allowed
+
+        return Case(form, quantity, value, check)
+
+    points = {"element_width": 0.0, "element_height": 0.0}
+    for metres in (1e-6, 1e-2, 1e2, 1e8):
+        yield each("card's distance", f"{metres:g} m", "spherical_convolution", 1e-5, card=card(y=-metres, **points))
+    yield each("card's distance", "1e8 m", "angle_convolution", 1e-5, card=card(y=-1e8, **points))
+    for degrees in (1e-3, 0.05, 1.0, 90.0):
+        yield each("lobe's width", f"{degrees:g}°", "spherical_convolution", 1e-3, brdf=lobes(degrees))
+    for samples in (0, 1, 2, 100_000):
+        yield each("directions K", str(samples), "spherical_convolution", 1e-5, samples=samples, brdf=lobes(30.0))
+    yield each("elements M", "1", "spherical_convolution", 1e-5, card=card(elements_x=(0.3,), **points))
+    yield each("view angle", "59.999°", "spherical_convolution", 1e-5, observer=observer(
+        view_angles=(math.radians(59.999),), pixels_at="edges"))  # fmt: skip
+
+
+# -- renders ----------------------------------------------------------------------------------------------------
+
+
+def render_cases() -> Iterator[Case]:
+    """Mitsuba against the model: right if no test rejects it and the gain is off by less than would have been seen."""
+
+    def each(quantity: str, value: str, **changes: Any) -> Case:
+        def check() -> tuple[float, float]:
+            options = dict(changes)
+            brdf = options.pop("brdf", lobes(15.0))
+            level = options.pop("level", 1.0)
+            eye = options.pop("observer", observer(pixels=24))
+            strips = options.pop("card", card())
+            wide = 4 * float(np.abs(wm.wall_points(eye)).max())
+            scene = wm.Scene(
+                name="extreme",
+                title="",
+                about="",
+                observer=eye,
+                card=strips,
+                wall=wm.Wall(brdf=brdf, half_width=wide, half_height=wide),
+                source=np.full((strips.elements, 1), level),
+            )
+            with warnings.catch_warnings():
+                warnings.simplefilter("default")  # those of the path tracer are not ours
+                found = validate_scene(scene, views=3, spp=256)
+            gain = found.comparison.gain
+            if found.comparison.kept == 0:
+                raise wm.UndeterminedError("every pixel shows a strip or an edge, so that nothing could be compared")
+            # What the run could have seen is its tolerance; a run that would see nothing is no check.
+            if not found.passed:
+                raise RuntimeError(f"rejected: gain {gain.estimate:+.1e}, largest z {found.comparison.largest_z:.1f}")
+            return (abs(gain.estimate) if gain.detectable < 0.5 else math.inf), max(gain.detectable, 1e-5)
+
+        return Case("validate_scene", quantity, value, check)
+
+    for factor in (1e-6, 1e-3, 1e3, 1e8):
+        yield each("whole scene", f"x {factor:g}", observer=observer(position=(0.0, -5 * factor), pixels=24), card=card(
+            elements_x=(-factor, 0.2 * factor, 1.1 * factor), y=-factor,
+            element_width=0.02 * factor, element_height=0.03 * factor))  # fmt: skip
+    for metres in (1e-6, 1e-4, 1e-2, 1e2, 1e4):
+        yield each("card's distance", f"{metres:g} m", card=card(y=-metres))
+    for level in (1e-300, 1e-36, 1e-30, 1e30, 1e37, 1e300):
+        yield each("radiance", f"{level:g}", level=level)
+    for degrees in (1e-3, 0.1, 1.0, 90.0):
+        yield each("lobe's width", f"{degrees:g}°", brdf=lobes(degrees))
+    for degrees in (45.0, 59.0, 59.9):
+        yield each("view angle", f"{degrees:g}°", observer=observer(view_angles=(math.radians(degrees),), pixels=24))
+    for number in (1, 2):
+        yield each("pixels N", str(number), observer=observer(pixels=number))
+
+
 # -- the table --------------------------------------------------------------------------------------------------
 
 
 def all_cases() -> list[Case]:
     """Every cell, in the order of the page."""
-    return [*formula_cases(), *forward_cases(), *inverse_cases(), *invariance_cases()]
+    return [
+        *formula_cases(),
+        *forward_cases(),
+        *convolution_cases(),
+        *inverse_cases(),
+        *invariance_cases(),
+        *render_cases(),
+    ]
 
 
 def page(cells: list[Cell]) -> str:

@@ -33,6 +33,8 @@ _POWER = 0.99
 # Pixels darker than this share of the brightest are starved: too few samples reach them for a t statistic.
 _STARVED = 1e-3
 _TILE = 10
+# Relative error that a renderer in float32 has in every sample alike, so that no number of samples averages it away.
+_FLOAT32 = float(np.finfo(np.float32).eps)
 _FOLDS = 4
 # Neighbours whose scatter steadies that of a pixel, and how many seeds their mean is worth.
 _NEIGHBOURS = 5
@@ -172,6 +174,10 @@ def compare(
         raise InputError(f"{seeds.shape[0]} seeds are too few to know their scatter; render at least 8", field="seeds")
     if not (np.all(np.isfinite(seeds)) and np.all(np.isfinite(reference))):
         raise InputError("holds a value that is not finite", field="seeds")
+    seeds, reference, *others = in_its_unit(reference, seeds, reference, *(templates or {}).values())
+    templates = dict(zip(templates or {}, others, strict=True))
+    if not np.all(np.isfinite(seeds)):
+        raise InputError("holds a value that no float64 can hold beside the reference", field="seeds")
     brightest = float(reference.max(initial=0.0))
     no_edges = np.ones(reference.shape, dtype=bool) if edges is None else ~edges
     bright = reference > _STARVED * brightest
@@ -185,12 +191,13 @@ def compare(
     elif weights.shape not in (reference.shape, seeds.shape):
         raise InputError(f"has shape {weights.shape}; give {reference.shape} or {seeds.shape}", field="weights")
     weights = np.broadcast_to(np.where(lit, weights, 0.0), seeds.shape)
-    shapes = {("gain", "of 1"): reference, **(templates or {})}
+    shapes = {("gain", "of 1"): reference, **templates}
     # One level for all tests of this comparison: the biases, the largest score and the tiles.
     level = SIGNIFICANCE / (len(shapes) + 2)
-    biases = tuple(_bias(name, unit, deviation, shape, weights, level) for (name, unit), shape in shapes.items())
-    z = _z_scores(deviation, keep, 1e-5 * brightest)
-    tile_p = _tile_p(deviation, reference, keep)
+    slack = _FLOAT32 * reference
+    biases = tuple(_bias(name, unit, deviation, shape, weights, slack, level) for (name, unit), shape in shapes.items())
+    z = _z_scores(deviation, keep, slack, 1e-5 * brightest)
+    tile_p = _tile_p(deviation, slack, keep)
     tiles = tile_p[np.isfinite(tile_p)]
     kept = z[keep]
     largest = float(np.max(np.abs(kept), initial=0.0))
@@ -222,6 +229,13 @@ def compare(
     )
 
 
+def in_its_unit(reference: Array, *arrays: Array) -> list[Array]:
+    """The arrays over a power of two near the reference's largest value, so that squares stay in range; nothing is rounded."""
+    exponent = math.frexp(float(np.max(reference, initial=0.0)))[1]
+    with np.errstate(over="ignore"):
+        return [np.asarray(np.ldexp(array, -exponent), dtype=np.float64) for array in arrays]
+
+
 def cross_weights(seeds: Array, reference: Array) -> Array:
     """Inverse variances of the pixels for each seed, as the seeds of the other folds scatter, shape (S, A, N).
 
@@ -237,6 +251,7 @@ def cross_weights(seeds: Array, reference: Array) -> Array:
     together and the amplitude would be biased; the seeds of three other folds may. Their variance in a pixel is drawn
     towards the mean of its neighbours, for 24 seeds know it to 30 % only.
     """
+    seeds, reference = in_its_unit(reference, seeds, reference)
     fold = np.arange(seeds.shape[0]) % _FOLDS
     weights = np.empty(seeds.shape)
     for mine in range(_FOLDS):
@@ -256,8 +271,16 @@ def cross_weights(seeds: Array, reference: Array) -> Array:
     return weights
 
 
-def _bias(name: str, unit: str, deviation: Array, shape: Array, weights: Array, level: float) -> BiasTest:
-    """Least-squares amplitude of a template in each seed; no seed has a say in its own weights, (S, A, N)."""
+def _beyond(values: Array, slack: Array) -> Array:
+    """What of the values lies beyond +-slack, with their signs."""
+    return np.asarray(np.sign(values) * np.maximum(np.abs(values) - slack, 0.0), dtype=np.float64)
+
+
+def _bias(name: str, unit: str, deviation: Array, shape: Array, weights: Array, slack: Array, level: float) -> BiasTest:
+    """Least-squares amplitude of a template in each seed; no seed has a say in its own weights, (S, A, N).
+
+    What deviations of `slack` (A, N), float32's own, can make of the amplitude at most is no bias.
+    """
     power = np.einsum("san,an->s", weights, shape * shape)
     if not np.all(power > 0):
         return BiasTest(name, unit, 0.0, math.inf, (-math.inf, math.inf), 1.0, math.inf)
@@ -268,10 +291,10 @@ def _bias(name: str, unit: str, deviation: Array, shape: Array, weights: Array, 
     if error == 0:
         return BiasTest(name, unit, estimate, 0.0, (estimate, estimate), 1.0 if abs(estimate) < 1e-5 else 0.0, 1e-5)
     half = float(stats.t.ppf(0.995, count - 1)) * error
-    p_value = float(2 * stats.t.sf(abs(estimate) / error, count - 1))
-    return BiasTest(
-        name, unit, estimate, error, (estimate - half, estimate + half), p_value, _units(level, count) * error
-    )
+    allowed = float(np.max(np.einsum("an,san,an->s", slack, weights, np.abs(shape)) / power))
+    p_value = float(2 * stats.t.sf(max(abs(estimate) - allowed, 0.0) / error, count - 1))
+    detectable = _units(level, count) * error + allowed
+    return BiasTest(name, unit, estimate, error, (estimate - half, estimate + half), p_value, detectable)
 
 
 @functools.cache
@@ -281,7 +304,7 @@ def _units(level: float, count: int) -> float:
     return float(brentq(lambda d: stats.nct.sf(threshold, count - 1, d) - _POWER, threshold, 10 * threshold + 10))
 
 
-def _z_scores(deviation: Array, keep: NDArray[np.bool_], rounding: float) -> Array:
+def _z_scores(deviation: Array, keep: NDArray[np.bool_], slack: Array, rounding: float) -> Array:
     """t over seeds in each pixel, mapped to the normal score of the same probability.
 
     A pixel that does not scatter at all scores 0 within `rounding`, and beyond it 38, the largest score that float64 knows.
@@ -291,13 +314,13 @@ def _z_scores(deviation: Array, keep: NDArray[np.bool_], rounding: float) -> Arr
     good = keep & (error > 0)
     mean = deviation.mean(axis=0)
     t = np.where(np.abs(mean) > rounding, np.copysign(np.inf, mean), 0.0)
-    np.divide(mean, error, out=t, where=good)
+    np.divide(_beyond(mean, slack), error, out=t, where=good)
     # Through the nearer tail, where probabilities keep their precision.
     score = np.minimum(-stats.norm.ppf(stats.t.sf(np.abs(t), count - 1)), 38.0)
     return np.asarray(np.sign(t) * score, dtype=np.float64)
 
 
-def _tile_p(deviation: Array, reference: Array, keep: NDArray[np.bool_]) -> Array:
+def _tile_p(deviation: Array, slack: Array, keep: NDArray[np.bool_]) -> Array:
     """Two-sided p-value of the t test on the mean of each run of pixels, (A, tiles)."""
     count, views, pixels = deviation.shape
     tiles = pixels // _TILE
@@ -308,6 +331,7 @@ def _tile_p(deviation: Array, reference: Array, keep: NDArray[np.bool_]) -> Arra
     used = keep[:, : tiles * _TILE].reshape(views, tiles, _TILE).any(axis=-1)
     error = sums.std(axis=0, ddof=1) / math.sqrt(count)
     used &= error > 0
-    t = np.divide(sums.mean(axis=0), error, out=np.zeros(error.shape), where=used)
+    allowed = np.where(keep, slack, 0.0)[:, : tiles * _TILE].reshape(views, tiles, _TILE).sum(axis=-1)
+    t = np.divide(_beyond(sums.mean(axis=0), allowed), error, out=np.zeros(error.shape), where=used)
     p = 2 * stats.t.sf(np.abs(t), count - 1)
     return np.where(used, p, np.nan)

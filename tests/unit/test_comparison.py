@@ -150,7 +150,10 @@ def test_a_bias_is_scipys_t_test_of_least_squares_amplitudes() -> None:
         for bias, shape in zip(comparison.biases, (picture(), shift())):
             column = (weight * shape).reshape(-1, 1)
             amplitudes = [np.linalg.lstsq(column, (weight * (s - picture())).ravel())[0][0] for s in seeds]
-            expected = stats.ttest_1samp(amplitudes, 0.0)
+            # The null is the nearest amplitude that float32's own relative error in every pixel could make.
+            spacing = float(np.finfo(np.float32).eps)
+            most = spacing * np.sum(weight**2 * picture() * np.abs(shape)) / np.sum((weight * shape) ** 2)
+            expected = stats.ttest_1samp(amplitudes, math.copysign(most, np.mean(amplitudes)))
             assert bias.estimate == pytest.approx(np.mean(amplitudes), rel=1e-10)
             assert bias.standard_error == pytest.approx(stats.sem(amplitudes), rel=1e-10)
             assert bias.p_value == pytest.approx(expected.pvalue, rel=1e-8)
@@ -402,3 +405,23 @@ def test_an_unseen_template_can_be_told_in_json() -> None:
     found = compare(picture() + noisy(np.random.default_rng(12)), picture(), templates={("none", "of 1"): template})
     told = json.loads(json.dumps(found.summary(), allow_nan=False))
     assert told["biases"][1]["detectable_99"] is None
+
+
+@pytest.mark.parametrize(("relative", "passes"), [(1e-7, True), (1e-5, False)])
+def test_what_float32_does_to_every_sample_is_no_bias_and_a_hundred_times_as_much_is(
+    relative: float, passes: bool
+) -> None:
+    reference = np.ones((2, 40))
+    noise = 1e-9 * np.random.default_rng(1).standard_normal((16, *reference.shape))
+    # Scatter below float32's spacing, so that the common shift is what is judged; not so little that none is seen.
+    assert compare(reference * (1 + relative) + 1e4 * noise, reference).passed is passes
+
+
+@pytest.mark.parametrize("power", [-1000, 1000])
+def test_the_verdict_knows_no_unit(power: int) -> None:
+    rng = np.random.default_rng(2)
+    reference = 1 + rng.random((2, 40))
+    seeds = reference + 0.1 * rng.standard_normal((16, 2, 40))
+    plain = compare(seeds, reference)
+    scaled = compare(np.ldexp(seeds, power), np.ldexp(reference, power))
+    assert scaled.summary() == plain.summary()

@@ -87,7 +87,8 @@ def _pinhole(scene: Scene, fov_deg: float, width: int, height: int) -> dict[str,
         "type": "perspective",
         "fov": fov_deg,
         "fov_axis": "x",
-        "near_clip": 1e-3 * reach,
+        # An observer close to the wall under a far card must not look past the wall.
+        "near_clip": 1e-3 * min(reach, scene.observer.distance / metres_per_unit(scene)),
         "far_clip": 1e5 * reach,
         "film": {
             "type": "hdrfilm",
