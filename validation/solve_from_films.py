@@ -20,9 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from wallmirror import load_scene
+from wallmirror.brdf import directional_albedo
 from wallmirror.console import Terminal
 from wallmirror.files import write_atomically
-from wallmirror.interreflection import directional_albedo
 from wallmirror.jobs.capturing import capture_scene
 from wallmirror.jobs.solving import solve_directory
 

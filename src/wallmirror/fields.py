@@ -9,9 +9,11 @@ import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from wallmirror.errors import InputError
+
+Word = TypeVar("Word", bound=str)
 
 
 def shipped_names(folder: str) -> tuple[str, ...]:
@@ -113,12 +115,37 @@ class Fields:
             raise self.error(name, f"has {len(value)} entries; give {size}")
         return tuple(self._as_number(name, entry, -math.inf, math.inf) for entry in value)
 
+    def one_of(self, name: str, options: tuple[Word, ...], default: Word) -> Word:
+        """One of a few strings, typed as the options are."""
+        value = self.choice(name, options, default)
+        return next(option for option in options if option == value)
+
     def text(self, name: str, default: str | None = None) -> str:
         """A string; required when there is no default."""
         value = self._take(name, default)
         if not isinstance(value, str):
             raise self.error(name, f"is {value!r}; give a text in quotes")
         return value
+
+    def inside(self, name: str, folder: str) -> Path:
+        """A file beside the one being read, which may not leave its folder, links followed.
+
+        Parameters
+        ----------
+        folder:
+            What to call that folder in messages ("set's").
+        """
+        text = self.text(name)
+        directory = self.file.parent
+        if not text or "\0" in text or Path(text).is_absolute():
+            raise self.error(name, f"is {text!r}; give the name of a file in the {folder} folder")
+        try:
+            leaves = not (directory / text).resolve().is_relative_to(directory.resolve())
+        except (OSError, RuntimeError):  # links that go round in circles
+            leaves = True
+        if leaves:
+            raise self.error(name, f'"{text}" leads out of the {folder} folder; move the file into it')
+        return directory / text
 
     def texts(self) -> dict[str, str]:
         """All entries of a free-form table of strings."""

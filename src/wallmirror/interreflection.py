@@ -34,20 +34,6 @@ _WALL_NODES = 1500
 _STRIP_NODES = 4
 
 
-def directional_albedo(brdf: AngleSumBRDF, incidence: float = 0.0) -> float:
-    """Share of light from one in-plane direction (radians) that the wall reflects: (pi/2) int rho cos theta_o.
-
-    Examples
-    --------
-    >>> from wallmirror.brdf import Diffuse
-    >>> round(directional_albedo(Diffuse(albedo=0.5)), 6)
-    0.5
-    """
-    edges = np.linspace(-math.pi / 2, math.pi / 2, 7201)
-    theta = 0.5 * (edges[1:] + edges[:-1])
-    return float(math.pi / 2 * np.sum(brdf.of_sum(incidence + theta) * np.cos(theta)) * (edges[1] - edges[0]))
-
-
 def from_card(observer: Observer, card: Card, brdf: AngleSumBRDF, source: Array) -> Array:
     """Radiance that the camera receives from light that the card has reflected at least once, (A, N, B).
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wallmirror.brdf import BRDF, AngleSumBRDF, Diffuse, GaussianTrain, Mirror, Phong, Sum
+from wallmirror.brdf import BRDF
 from wallmirror.errors import InputError
 from wallmirror.fields import Fields, named_toml, read_toml, shipped_names
 from wallmirror.geometry import Card, Observer, scan_angles, wall_points
+from wallmirror.wall_reading import read_brdf
 
 Array = NDArray[np.float64]
 
@@ -212,36 +212,13 @@ def read_room(fields: Fields) -> Room:
 
 
 def _wall(fields: Fields) -> Wall:
-    kind = fields.choice("brdf", tuple(_MODELS))
-    brdf = _MODELS[kind](fields)
-    if isinstance(brdf, AngleSumBRDF) and fields.has("diffuse_albedo"):
-        brdf = Sum(parts=(brdf, Diffuse(albedo=fields.number("diffuse_albedo", low=0.0, high=1.0))))
     wall = Wall(
-        brdf=brdf,
+        brdf=read_brdf(fields),
         half_width=fields.number("half_width", 20.0, low=1e-3, high=1e6),
         half_height=fields.number("half_height", 20.0, low=1e-3, high=1e6),
     )
     fields.finish()
     return wall
-
-
-def _gaussian_train(fields: Fields) -> GaussianTrain:
-    heights = {"peak": "peak", "per_degree": "per_degree", "per_radian": "per_radian"}
-    height = fields.choice("height", tuple(heights), "peak")
-    return GaussianTrain(
-        centres=tuple(math.radians(c) for c in fields.numbers("centres_deg")),
-        sigma=math.radians(fields.number("sigma_deg")),
-        height="per_degree" if height == "per_degree" else "per_radian" if height == "per_radian" else "peak",
-        scale=fields.number("scale", 1.0),
-    )
-
-
-_MODELS: dict[str, Callable[[Fields], BRDF]] = {
-    "diffuse": lambda f: Diffuse(albedo=f.number("albedo")),
-    "mirror": lambda f: Mirror(reflectance=f.number("reflectance", 1.0)),
-    "phong": lambda f: Phong(exponent=f.number("exponent"), reflectance=f.number("reflectance", 0.5)),
-    "gaussian_train": _gaussian_train,
-}
 
 
 def _source(fields: Fields, card: Card) -> Array:

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wallmirror.brdf import Table
+from wallmirror.brdf import Table, directional_albedo
 from wallmirror.errors import InputError
-from wallmirror.interreflection import directional_albedo, from_card, from_room
+from wallmirror.interreflection import from_card, from_room
 from wallmirror.jobs import bouncing
 from wallmirror.jobs.bouncing import (
     SETTINGS,

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from scipy import integrate, special, stats
 from scipy.interpolate import RegularGridInterpolator
 
-from wallmirror.brdf import AngleSumTable
-from wallmirror.interreflection import directional_albedo
+from wallmirror.brdf import AngleSumTable, directional_albedo
 
 from .soundness import diffuse, directions, lobes, measured, of_sum, phong, plugin_dict, ridge, u
 

@@ -7,13 +7,20 @@ import pkgutil
 import pytest
 
 import wallmirror
+import wallmirror.brdf
 import wallmirror.captures
 import wallmirror.convolution
 import wallmirror.derendering
 
 CORE = sorted(
     module.name
-    for package in (wallmirror, wallmirror.captures, wallmirror.convolution, wallmirror.derendering)
+    for package in (
+        wallmirror,
+        wallmirror.brdf,
+        wallmirror.captures,
+        wallmirror.convolution,
+        wallmirror.derendering,
+    )
     for module in pkgutil.iter_modules(package.__path__, package.__name__ + ".")
     if not module.ispkg and module.name != "wallmirror.__main__"
 )

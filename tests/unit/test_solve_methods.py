@@ -13,7 +13,7 @@ import pytest
 import scipy.stats
 from numpy.typing import NDArray
 
-from wallmirror.brdf import AngleSumBRDF, AngleSumTable, Diffuse
+from wallmirror.brdf import AngleSumBRDF, AngleSumTable, Diffuse, directional_albedo
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.components import components
 from wallmirror.derendering.noisy import require_patterns
@@ -22,7 +22,6 @@ from wallmirror.derendering.solution import Solution
 from wallmirror.derendering.solve import Method, solve
 from wallmirror.derendering.subspace import noise_edge
 from wallmirror.geometry import Card, Observer
-from wallmirror.interreflection import directional_albedo
 from wallmirror.transport import Weights, radiance, transport_matrix
 
 from .helpers import EPS, assert_undetermined, far_apart, lobes, refused, thesis_card, thesis_observer, up_to_scale

@@ -85,7 +85,7 @@ def read_captures(directory: str | Path) -> CaptureSet:
         raise InputError(f"no such folder; give the one that holds {CAPTURES_FILE}", file=directory)
     root = read_toml(directory / CAPTURES_FILE)
     try:
-        return _capture_set(root, directory)
+        return _capture_set(root)
     except InputError as error:
         raise error.located(file=root.file) from None
 
@@ -125,7 +125,7 @@ def read_truth(directory: str | Path) -> Truth | None:
 _TRUTH_FIELDS = {"source", "theta_s_deg", "theta_o_deg", "brdf"}
 
 
-def _capture_set(root: Fields, directory: Path) -> CaptureSet:
+def _capture_set(root: Fields) -> CaptureSet:
     if root.integer("format") != 1:
         raise root.error("format", "is not 1, the only format of capture sets that this version reads")
     weights: Sequence[Weights] = get_args(Weights)
@@ -138,7 +138,7 @@ def _capture_set(root: Fields, directory: Path) -> CaptureSet:
     room = read_room(root.table("room")) if root.has("room") else None
     provenance = root.table("provenance", required=False).texts()
     variance_is_floor = root.flag("variance_is_floor", False)
-    captures = [_capture(fields, directory, observer, channel, row) for fields in root.tables("captures")]
+    captures = [_capture(fields, observer, channel, row) for fields in root.tables("captures")]
     root.finish()
     realisations = _require_complete(root, captures, observer)
 
@@ -177,7 +177,7 @@ def _row_number(fields: Fields) -> int | None:
     return fields.integer("row", high=1_000_000) if fields.has("row") else None
 
 
-def _capture(fields: Fields, directory: Path, observer: Observer, channel: str, row: int | None) -> _Capture:
+def _capture(fields: Fields, observer: Observer, channel: str, row: int | None) -> _Capture:
     exposure = fields.number("exposure", 1.0, low=1 / _MAX_EXPOSURE, high=_MAX_EXPOSURE)
     saturation = fields.number("saturation", low=0.0) if fields.has("saturation") else math.inf
     if saturation == 0:
@@ -185,8 +185,8 @@ def _capture(fields: Fields, directory: Path, observer: Observer, channel: str, 
     own_row = _row_number(fields)
     capture = _Capture(
         fields=fields,
-        file=_inside(fields, "file", directory),
-        variance_file=_inside(fields, "variance_file", directory) if fields.has("variance_file") else None,
+        file=fields.inside("file", "set's"),
+        variance_file=fields.inside("variance_file", "set's") if fields.has("variance_file") else None,
         view=fields.integer("view", high=observer.views - 1),
         realisation=fields.integer("realisation"),
         channel=fields.text("channel", channel),
@@ -196,21 +196,6 @@ def _capture(fields: Fields, directory: Path, observer: Observer, channel: str, 
     )
     fields.finish()
     return capture
-
-
-def _inside(fields: Fields, name: str, directory: Path) -> Path:
-    """The file that a field names, which must lie in the set's folder, links followed."""
-    text = fields.text(name)
-    if not text or "\0" in text or Path(text).is_absolute():
-        raise fields.error(name, f"is {text!r}; give the name of a file in the set's folder")
-    try:
-        path = (directory / text).resolve()
-        leaves = not path.is_relative_to(directory.resolve())
-    except (OSError, RuntimeError):  # links that go round in circles
-        leaves = True
-    if leaves:
-        raise fields.error(name, f'"{text}" leads out of the set\'s folder; move the file into it')
-    return directory / text
 
 
 def _require_complete(root: Fields, captures: list[_Capture], observer: Observer) -> int:

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wallmirror.brdf import AngleSumTable
+from wallmirror.brdf import AngleSumTable, directional_albedo
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.estimate import Estimate, scale_free_error
 from wallmirror.derendering.likelihood import maximise, moments
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import SplineGrid
-from wallmirror.interreflection import directional_albedo, from_card, from_room
+from wallmirror.interreflection import from_card, from_room
 
 Array = NDArray[np.float64]
 

@@ -11,14 +11,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from wallmirror.brdf import AngleSumTable
+from wallmirror.brdf import AngleSumTable, directional_albedo
 from wallmirror.derendering.components import components
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.one_bounce import OneBounceCheck
 from wallmirror.derendering.problem import Problem, expected_mismatch
 from wallmirror.derendering.subspace import SignalSpace
 from wallmirror.errors import InputError, UndeterminedError
-from wallmirror.interreflection import directional_albedo
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wallmirror.brdf import Mirror
+from wallmirror.brdf import AngleSumBRDF
 from wallmirror.captures import CaptureSet, Truth, write_captures
 from wallmirror.console import Advance
 from wallmirror.pathtracing.filming import render_captures
@@ -48,9 +48,9 @@ def capture_scene(
 
 
 def truth_of(scene: Scene) -> Truth:
-    """Pattern and BRDF that a scene is made of, to judge a solution by."""
+    """Pattern and BRDF that a scene is made of, to judge a solution by; without a BRDF that is no function of u."""
     u = np.linspace(-math.pi, math.pi, _TRUTH_NODES)
-    if isinstance(scene.wall.brdf, Mirror):
+    if not isinstance(scene.wall.brdf, AngleSumBRDF):
         u = u[:0]
         return Truth(source=scene.source, theta_s=u, theta_o=u, brdf=u)
-    return Truth(source=scene.source, theta_s=u / 2, theta_o=u / 2, brdf=scene.wall.brdf(u / 2, u / 2))
+    return Truth(source=scene.source, theta_s=u / 2, theta_o=u / 2, brdf=scene.wall.brdf.of_sum(u))

@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from wallmirror.brdf import AngleSumBRDF
+from wallmirror.brdf import AngleSumBRDF, directional_albedo
 from wallmirror.files import write_atomically
-from wallmirror.interreflection import directional_albedo
 from wallmirror.jobs.capturing import capture_scene
 from wallmirror.jobs.solving import Solved, solution_sections, solve_directory
 from wallmirror.jobs.solving import verdicts as solution_verdicts

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wallmirror.brdf import AngleSumBRDF, Mirror
+from wallmirror.brdf import AngleSumBRDF, Mirror, directional_albedo
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.solve import solve
 from wallmirror.errors import InputError
-from wallmirror.interreflection import directional_albedo, glow_in_mirror
+from wallmirror.interreflection import glow_in_mirror
 from wallmirror.jobs.bouncing import DEEP, RR_DEPTH, json_of, spread
 from wallmirror.jobs.capturing import truth_of
 from wallmirror.jobs.solving import judge

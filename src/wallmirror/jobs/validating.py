@@ -50,6 +50,9 @@ class Validation:
         Analytic and path-traced radiance of the views compared, (A, N).
     views:
         Indices of those views.
+    interpolation:
+        How far the table that Mitsuba holds is from the wall's model after transport: the largest difference of two
+        analytic radiances over the largest radiance. The comparison is with the table and does not contain it.
     same_as:
         Name of the scene whose render this is, where two differ in nothing that one bounce meets; else empty.
     """
@@ -61,6 +64,7 @@ class Validation:
     comparison: Comparison
     spp: int
     seconds: float
+    interpolation: float
     same_as: str = ""
 
     @property
@@ -77,6 +81,7 @@ class Validation:
             "spp_per_seed": self.spp,
             "same_as": self.same_as or None,
             "seconds": self.seconds,
+            "table_interpolation": self.interpolation,
             **self.comparison.summary(),
         }
 
@@ -120,6 +125,7 @@ def validate_scene(
         judge(sample, expectation),
         spp,
         seconds=time.perf_counter() - started,
+        interpolation=expectation.interpolation,
     )
 
 
@@ -143,11 +149,14 @@ class Expectation:
         For each (name, unit) of a bias its change of the reference per unit, shape (A, N).
     edges:
         Pixels that are left out, shape (A, N).
+    interpolation:
+        As for `Validation`.
     """
 
     reference: Array
     templates: dict[tuple[str, str], Array]
     edges: NDArray[np.bool_]
+    interpolation: float
 
 
 def render_seeds(
@@ -206,7 +215,14 @@ def expect(
         edges |= _beside(edges)
     else:
         edges = _behind_strips(observer, scene.card)
-    return Expectation(analytic(brdf), _templates(scene, analytic), edges)
+    reference = analytic(brdf)
+    off = float(np.max(np.abs(reference - analytic(scene.wall.brdf)), initial=0.0))
+    return Expectation(
+        reference,
+        _templates(scene, analytic),
+        edges,
+        interpolation=off / max(float(reference.max(initial=0.0)), 1e-300),
+    )
 
 
 def judge(sample: Sample, expectation: Expectation) -> Comparison:
@@ -383,5 +399,8 @@ def numbers(result: Validation) -> TableBlock:
     rows.append(("largest |z|", f"{c.largest_z:.2f}", "", f"{c.largest_p:.3g}", "Sidak-corrected"))
     rows.append(("p-values of tiles uniform", "", "", f"{c.uniformity_p:.3g}", "Kolmogorov-Smirnov"))
     rows.append(("pixels", f"{c.kept} kept", f"{c.starved} starved", f"{c.edges} at edges", ""))
+    rows.append(
+        ("table interpolation", f"{result.interpolation:.1e} of the brightest pixel", "", "", "not in the test")
+    )
     rows.append(("cost", f"{result.seconds:.1f} s", f"{SEEDS} seeds", f"{result.spp} spp each", ""))
     return TableBlock(("test", "found", "standard error", "p-value", "would be caught from"), tuple(rows))

@@ -6,7 +6,7 @@ from load to load, and with it the emitters' order and every sample drawn from t
 
 What the path tracer sees differs from the Scene in three ways:
 
-- BRDFs of the angle sum are tables of float32 (`wall_as_rendered` gives what is really there);
+- BRDFs are tables of float32 (`wall_as_rendered` gives what is really there);
 - lengths are in units of `cameras.metres_per_unit`, 1 for scenes of ordinary size: Mitsuba starts rays about
   9e-5 (1 + |p|) beside the point p that they leave, which a card closer than one unit would notice;
 - the camera looks through the card, which is an emitter, strips and board, so that `hide_emitters` hides it; what it
@@ -15,8 +15,10 @@ What the path tracer sees differs from the Scene in three ways:
 
 from __future__ import annotations
 
+import functools
 import importlib
 import math
+from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wallmirror.brdf import BRDF, AngleSumBRDF, AngleSumTable, Diffuse, Mirror, Table, tabulate
+from wallmirror.brdf import BRDF, AngleSumBRDF, AngleSumTable, Diffuse, Mirror, Table, tabulate, tabulate_to
 from wallmirror.errors import InputError
 from wallmirror.pathtracing import bsdf
 from wallmirror.pathtracing.cameras import Sampler, metres_per_unit, sensor_dict, to_world
@@ -36,10 +38,12 @@ Array = NDArray[np.float64]
 _X = (1.0, 0.0, 0.0)
 _Y = (0.0, 1.0, 0.0)
 _Z = (0.0, 0.0, 1.0)
+#: Largest interpolation error of a wall that is tabulated over both angles, relative to its largest value.
+GRID_TOLERANCE = 1e-3
 _BOARD_GAP = 1e-3  # between strips and board, in card distances: far above float32, far below what light would notice
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class RenderedTable(AngleSumTable):
     """The float32 table that stands for a smooth model in a render.
 
@@ -57,17 +61,30 @@ class RenderedTable(AngleSumTable):
         return self.smooth_over
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RenderedGrid(Table):
+    """The same for a model of both angles."""
+
+    smooth_over: float
+
+    @property
+    def angular_scale(self) -> float:
+        """That of the model which was tabulated, in radians."""
+        return self.smooth_over
+
+
 def wall_as_rendered(scene: Scene) -> BRDF:
     """The wall's BRDF as the path tracer holds it; compare the analytic model with this, not with `scene.wall.brdf`.
 
     Tables keep their nodes where a plugin can hold them; every other model of the angle sum is tabulated on 7201
     nodes (1.2e-5 of the peak off for lobes of sigma 1 deg), or for narrower lobes on proportionally more, up to
-    720001. All values are rounded to float32.
+    720001. Models of both angles are tabulated until their interpolation errs by at most `GRID_TOLERANCE`. All values are
+    rounded to float32.
 
     Raises
     ------
     InputError
-        For a BRDF that no plugin can hold.
+        For a BRDF that no table can hold.
     """
     brdf = scene.wall.brdf
     match brdf:
@@ -89,7 +106,16 @@ def wall_as_rendered(scene: Scene) -> BRDF:
         case Table():
             return Table(values=_float32(brdf.values))
         case _:
-            raise InputError(f"{type(brdf).__name__} cannot be rendered; tabulate it", field="wall.brdf")
+            if type(brdf).__call__ is BRDF.__call__:  # a distribution, or nothing at all
+                raise InputError(f"{type(brdf).__name__} cannot be rendered; give a table of it", field="wall.brdf")
+            return _grid(brdf) if isinstance(brdf, Hashable) else _grid.__wrapped__(brdf)
+
+
+@functools.lru_cache(maxsize=4)
+def _grid(brdf: BRDF) -> RenderedGrid:
+    """A model of both angles on a table, kept: a wall is asked for several times by one comparison."""
+    values = tabulate_to(brdf, GRID_TOLERANCE).table.values
+    return RenderedGrid(values=_float32(values), smooth_over=brdf.angular_scale)
 
 
 def mitsuba_dict(
