@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wallmirror import Mirror, load_scene, read_captures, scale_free_error
-from wallmirror.brdf import GaussianTrain
+from wallmirror import Mirror, load_scene, read_captures, scale_free_error, scene_names
+from wallmirror.brdf import GaussianTrain, Table
 from wallmirror.interreflection import from_card, from_room
 from wallmirror.jobs import validating
 from wallmirror.jobs.capturing import capture_scene
 from wallmirror.jobs.solving import solve_directory
-from wallmirror.jobs.validating import validate_scene, validate_scenes
+from wallmirror.jobs.validating import expect, validate_scene, validate_scenes
 from wallmirror.pathtracing.rendering import Renderer, spread_seeds
 from wallmirror.transport import radiance, transport_matrix
 
@@ -42,7 +42,7 @@ def test_films_written_read_back_and_solved_are_as_good_as_their_error_bars(mi, 
     assert scale_free_error(estimate, scene.source) == pytest.approx(solved.judgement.source_error)
 
 
-@pytest.mark.parametrize("name", ["flat_wall_lobes", "flat_wall_diffuse", "flat_wall_phong", "flat_wall_mirror"])
+@pytest.mark.parametrize("name", [name for name in scene_names() if name.startswith("flat_wall")])
 def test_model_and_mitsuba_are_not_told_apart(mi, name):
     result = validate_scene(small(name), views=3, spp=64, seed=11)
     assert result.passed
@@ -50,6 +50,41 @@ def test_model_and_mitsuba_are_not_told_apart(mi, name):
     # Scores of a true model have unit spread; with K kept pixels their standard deviation scatters by 1/sqrt(2K).
     if not result.comparison.exact:
         assert abs(result.comparison.z_std - 1) < 5 / np.sqrt(2 * result.comparison.kept)
+
+
+@pytest.mark.parametrize("name", ["flat_wall_blinn", "flat_wall_cook_torrance"])
+def test_interpolation_of_a_wall_in_a_table_is_told_apart_from_transport(mi, name):
+    """The table is 1e-3 of its peak right, and on the wall, where pixels average, a hundredth of that."""
+    scene = small(name)
+    found = expect(scene, (0, 1)).interpolation
+    assert 1e-9 < found < 1e-4
+    # The twin: a table of a tenth of the nodes, as if it were the wall's.
+    brdf = scene.wall.brdf
+    theta = np.linspace(-np.pi / 2, np.pi / 2, 91)
+    coarse = Table(values=brdf(theta[:, None], theta))
+    fine = expect(scene, (0, 1)).reference
+    rough = expect(replace(scene, wall=replace(scene.wall, brdf=coarse)), (0, 1)).reference
+    assert np.max(np.abs(rough - fine)) > 1e-4 * fine.max()
+
+
+def plant_rougher(scene):
+    return replace(scene, wall=replace(scene.wall, brdf=replace(scene.wall.brdf, alpha=0.21)))
+
+
+def plant_swapped(scene):
+    """Light and camera mistaken for each other on a wall that is not reciprocal."""
+    return replace(scene, wall=replace(scene.wall, brdf=Table(values=scene.wall.brdf.values.T)))
+
+
+def test_a_wall_that_is_a_function_of_both_angles_is_judged(mi, monkeypatch):
+    scene = small("flat_wall_cook_torrance")
+    theta = np.linspace(-np.pi / 2, np.pi / 2, 181)
+    lopsided = Table(values=scene.wall.brdf(theta[:, None], theta) * (1 + 0.5 * np.sin(theta)))
+    measured = replace(scene, wall=replace(scene.wall, brdf=lopsided))
+    assert validate_scene(measured, views=3, spp=64, seed=11).passed
+    for case, plant in ((scene, plant_rougher), (measured, plant_swapped)):
+        monkeypatch.setattr(validating, "Renderer", lambda s, plant=plant, **options: Renderer(plant(s), **options))
+        assert not validate_scene(case, views=3, spp=64, seed=11).passed
 
 
 def plant_gain(scene):
