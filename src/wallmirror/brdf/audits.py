@@ -171,7 +171,9 @@ def _energy(brdf: BRDF, tolerance: float) -> Finding:
     count = min(_LEAST_NODES, max(181, math.ceil(math.pi / brdf.angular_scale) + 1))
     incidence = np.linspace(GRAZING - math.pi / 2, math.pi / 2 - GRAZING, 2 * (count // 2) + 1)
     albedos = directional_albedos(brdf, incidence)
-    best = int(np.argmax(albedos))
+    # Of directions that are equally bad the most upright one.
+    worst = np.flatnonzero(albedos >= albedos.max() * (1 - 1e-12))
+    best = int(worst[np.argmin(np.abs(incidence[worst]))])
     around = incidence[max(best - 1, 0)], incidence[min(best + 1, incidence.size - 1)]
 
     def shortfall(angle: float) -> float:

@@ -11,6 +11,8 @@ from wallmirror.thesis.figure import ThesisFigure
 # Modules of this package by section. Each has FIGURES: dict[str, Callable[[int], ThesisFigure]], from a figure's id to
 # the function that makes it from a seed.
 _MODULES = (
+    "radiometry",
+    "reflectance",
     "geometry_diagrams",
     "algorithm_1",
     "pictures",
