@@ -15,11 +15,13 @@ import pytest
 from wallmirror.brdf import (
     BRDF,
     AngleSumTable,
+    CookTorrance,
     Diffuse,
     GaussianTrain,
     Mirror,
     Phong,
     Table,
+    tables,
 )
 from wallmirror.errors import InputError
 from wallmirror.geometry import Card, Observer, pixel_tangents, wall_points
@@ -132,6 +134,13 @@ def test_the_wall_as_rendered_is_what_the_plugin_holds(mi: Any) -> None:
     held = mi.traverse(load(mi, scene(lobes)))["wall.bsdf.table"]
     np.testing.assert_array_equal(np.array(held), rendered.values)
 
+    facets = CookTorrance(alpha=0.3)
+    rendered = building.wall_as_rendered(scene(facets))
+    assert isinstance(rendered, building.RenderedGrid)
+    assert rendered.angular_scale == facets.angular_scale
+    held = mi.traverse(load(mi, scene(facets)))["wall.bsdf.table"]
+    np.testing.assert_array_equal(np.array(held), rendered.values)
+
     grid = Table(values=np.arange(12.0).reshape(3, 4) / 7)
     rendered = building.wall_as_rendered(scene(grid))
     assert isinstance(rendered, Table)
@@ -157,6 +166,18 @@ def test_the_wall_as_rendered_keeps_what_can_be_kept() -> None:
     assert sharp.values.size == 72001
     with pytest.raises(InputError, match=r"wall\.brdf.*BRDF cannot be rendered"):
         building.wall_as_rendered(scene(BRDF()))
+
+
+def test_a_narrow_lobe_of_both_angles_gets_a_coarser_table_rather_than_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "MOST_ANGLE_NODES", 600)  # 2881 take seconds
+    narrow = CookTorrance(alpha=0.19)
+    rendered = building.wall_as_rendered(scene(narrow))
+    assert isinstance(rendered, building.RenderedGrid)
+    theta = np.linspace(-1.57, 1.57, 1000)
+    error = np.max(np.abs(rendered(theta[:, None], theta) - narrow(theta[:, None], theta))) / rendered.values.max()
+    assert building.GRID_TOLERANCE < error < 1.2 * building.NARROW_TOLERANCE
+    with pytest.raises(InputError, match="is left"):
+        building.wall_as_rendered(scene(CookTorrance(alpha=0.02)))
 
 
 @pytest.mark.parametrize(

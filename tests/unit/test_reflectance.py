@@ -433,6 +433,9 @@ def test_an_audit_that_cannot_see_refuses() -> None:
             return 1e-6
 
     assert refused(lambda: audit(Needle())).field == "wall.brdf"
+    narrow = GaussianTrain(centres=(0.0,), sigma=1e-9)
+    assert refused(lambda: audit(narrow)).field == "wall.brdf"
+    assert refused(lambda: directional_albedo(narrow)).field == "wall.brdf"
     assert "finite" in refused(lambda: audit(Scaled(albedo=math.inf))).message
 
 

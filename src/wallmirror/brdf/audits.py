@@ -106,7 +106,8 @@ def audit(brdf: BRDF, *, tolerance: float = 1e-6) -> Audit:
     Raises
     ------
     InputError
-        If the model is finer than 3001 nodes along an angle can show, or not finite somewhere.
+        If the model is finer than 3001 nodes along an angle (6e-6 rad for one of the angle sum) can show, or not finite
+        somewhere.
 
     Examples
     --------
@@ -122,8 +123,9 @@ def audit(brdf: BRDF, *, tolerance: float = 1e-6) -> Audit:
         energy = Finding(passed=brdf.reflectance <= 1 + tolerance, value=brdf.reflectance, where=(0.0,))
         return Audit(non_negativity=fine, reciprocity=fine, energy=energy)
     signs = _signs_of_sum if isinstance(brdf, AngleSumBRDF) else _signs
+    energy = _energy(brdf, tolerance)
     non_negativity, reciprocity = signs(brdf, tolerance)
-    return Audit(non_negativity=non_negativity, reciprocity=reciprocity, energy=_energy(brdf, tolerance))
+    return Audit(non_negativity=non_negativity, reciprocity=reciprocity, energy=energy)
 
 
 def _signs_of_sum(brdf: BRDF, tolerance: float) -> tuple[Finding, Finding]:

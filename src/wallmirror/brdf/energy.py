@@ -14,10 +14,12 @@ from numpy.typing import ArrayLike
 
 from wallmirror.brdf.base import BRDF, Array
 from wallmirror.brdf.lobes import Mirror
+from wallmirror.errors import InputError
 
 _LEAST_PANELS = 90
 _ORDER = 4  # Gauss-Legendre nodes a panel, which is as wide as the model's angular scale
 _CHUNK = 2**21
+_MOST_PANELS = 2**19
 
 
 def directional_albedo(brdf: BRDF, incidence: float = 0.0) -> float:
@@ -33,10 +35,18 @@ def directional_albedo(brdf: BRDF, incidence: float = 0.0) -> float:
 
 
 def directional_albedos(brdf: BRDF, incidence: ArrayLike, *, finer: int = 1) -> Array:
-    """`directional_albedo` for many angles of incidence in radians, same shape, with `finer` times as many nodes."""
+    """`directional_albedo` for many angles of incidence in radians, same shape, with `finer` times as many nodes.
+
+    Raises
+    ------
+    InputError
+        If the model changes within less than 6e-6 rad, which the quadrature cannot resolve.
+    """
     angles = np.asarray(incidence, dtype=np.float64)
     if isinstance(brdf, Mirror):
         return np.full(angles.shape, brdf.reflectance)
+    if math.pi / brdf.angular_scale > _MOST_PANELS:
+        raise InputError(f"changes within {brdf.angular_scale:.2g} rad, too fine to integrate", field="wall.brdf")
     panels = finer * max(_LEAST_PANELS, math.ceil(math.pi / brdf.angular_scale - 1e-9))
     nodes, shares = np.polynomial.legendre.leggauss(_ORDER)
     half = math.pi / 2 / panels

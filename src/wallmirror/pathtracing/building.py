@@ -38,8 +38,9 @@ Array = NDArray[np.float64]
 _X = (1.0, 0.0, 0.0)
 _Y = (0.0, 1.0, 0.0)
 _Z = (0.0, 0.0, 1.0)
-#: Largest interpolation error of a wall that is tabulated over both angles, relative to its largest value.
-GRID_TOLERANCE = 1e-3
+#: Interpolation error wanted of a wall that is tabulated over both angles, relative to its largest value, and the one
+#: that narrow lobes are granted.
+GRID_TOLERANCE, NARROW_TOLERANCE = 1e-3, 1e-2
 _BOARD_GAP = 1e-3  # between strips and board, in card distances: far above float32, far below what light would notice
 
 
@@ -78,8 +79,8 @@ def wall_as_rendered(scene: Scene) -> BRDF:
 
     Tables keep their nodes where a plugin can hold them; every other model of the angle sum is tabulated on 7201
     nodes (1.2e-5 of the peak off for lobes of sigma 1 deg), or for narrower lobes on proportionally more, up to
-    720001. Models of both angles are tabulated until their interpolation errs by at most `GRID_TOLERANCE`. All values are
-    rounded to float32.
+    720001. Models of both angles are tabulated until their interpolation errs by at most `GRID_TOLERANCE`, or, where that
+    takes more than 2881 nodes along an angle, by `NARROW_TOLERANCE`. All values are rounded to float32.
 
     Raises
     ------
@@ -114,7 +115,10 @@ def wall_as_rendered(scene: Scene) -> BRDF:
 @functools.lru_cache(maxsize=4)
 def _grid(brdf: BRDF) -> RenderedGrid:
     """A model of both angles on a table, kept: a wall is asked for several times by one comparison."""
-    values = tabulate_to(brdf, GRID_TOLERANCE).table.values
+    try:
+        values = tabulate_to(brdf, GRID_TOLERANCE).table.values
+    except InputError:
+        values = tabulate_to(brdf, NARROW_TOLERANCE).table.values
     return RenderedGrid(values=_float32(values), smooth_over=brdf.angular_scale)
 
 
