@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from wallmirror.brdf import BRDF, AngleSumBRDF
+from wallmirror.brdf import AngleSumBRDF, CookTorrance, Schlick
 from wallmirror.convolution import angle_convolution, best_angle_sum, convolution_errors, relative_error
 from wallmirror.convolution.spherical import scene_angles
 from wallmirror.geometry import Card
@@ -176,11 +175,11 @@ def angle_sum(seed: int) -> ThesisFigure:
     names = ("ρ of the sum", "ρ cos θs of the sum", "q(θo) times one of the sum")
     residuals = {name: np.empty(roughness.size) for name in names}
     for k, alpha in enumerate(roughness):
-        metal = _RoughMetal(alpha=float(alpha))
+        metal = _rough_metal(float(alpha))
         residuals[names[0]][k] = best_angle_sum(metal, limit=_LIMIT).residual
         residuals[names[1]][k] = best_angle_sum(metal, limit=_LIMIT, weights="cosine").residual
         residuals[names[2]][k] = best_angle_sum(metal, limit=_LIMIT, weights="cosine", outgoing_factor=True).residual
-    metal = _RoughMetal(alpha=0.3)
+    metal = _rough_metal(0.3)
     observer, card = setting.observer(_PIXELS), setting.card()
     exact = radiance(transport_matrix(observer, card, metal, weights="cosine"), setting.SOURCE)[0]
     theta_s, theta_o = scene_angles(observer, card)
@@ -244,25 +243,8 @@ def angle_sum(seed: int) -> ThesisFigure:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _RoughMetal(BRDF):
-    """Cook-Torrance for directions in the plane; the half vector's angle is (theta_s + theta_o) / 2."""
-
-    alpha: float
-    normal_reflectance: float = 0.9
-
-    def __call__(self, theta_s: ArrayLike, theta_o: ArrayLike) -> Array:
-        s, o = np.asarray(theta_s, dtype=np.float64), np.asarray(theta_o, dtype=np.float64)
-        half = 0.5 * (s + o)
-        a2 = self.alpha**2
-        normals = a2 / (math.pi * (np.cos(half) ** 2 * (a2 - 1) + 1) ** 2)
-        masked = 1 / (1 + self._smith(s) + self._smith(o))
-        grazing = (1 - np.cos(0.5 * (s - o))) ** 5
-        fresnel = self.normal_reflectance + (1 - self.normal_reflectance) * grazing
-        return np.asarray(normals * masked * fresnel / (4 * np.cos(s) * np.cos(o)), dtype=np.float64)
-
-    def _smith(self, theta: Array) -> Array:
-        return np.asarray(0.5 * (np.sqrt(1 + (self.alpha * np.tan(theta)) ** 2) - 1), dtype=np.float64)
+def _rough_metal(alpha: float) -> CookTorrance:
+    return CookTorrance(alpha=alpha, fresnel=Schlick(f0=0.9), facets="isotropic")
 
 
 def _errors(card: Card, brdf: AngleSumBRDF) -> dict[str, float]:
