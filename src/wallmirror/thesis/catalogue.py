@@ -18,6 +18,10 @@ _MODULES = (
     "pictures",
     "rendering_as_convolution",
     "far_field",
+    "picture_deconvolution",
+    "wall_deconvolution",
+    # B
+    # S
 )
 
 
