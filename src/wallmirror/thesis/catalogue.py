@@ -20,7 +20,7 @@ _MODULES = (
     "far_field",
     "picture_deconvolution",
     "wall_deconvolution",
-    # B
+    "blind_deconvolution",
     # S
 )
 
