@@ -66,6 +66,7 @@ def align(estimate: ArrayLike, truth: ArrayLike) -> Aligned:
     into = tuple(slice(max(d, 0), max(min(n, m + d), 0)) for d, n, m in zip(shift, t.shape, e.shape, strict=True))
     taken = tuple(slice(i.start - d, i.stop - d) for i, d in zip(into, shift, strict=True))
     moved[into] = e[taken]
-    lost = energy - float(np.sum(moved * moved))
-    error = math.sqrt(max(float(np.sum((t - scale * moved) ** 2)) + scale**2 * lost, 0.0) / size)
+    beyond = e.copy()
+    beyond[taken] = 0.0
+    error = math.sqrt((float(np.sum((t - scale * moved) ** 2)) + scale**2 * float(np.sum(beyond**2))) / size)
     return Aligned(error, shift, scale)

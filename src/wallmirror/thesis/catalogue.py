@@ -21,7 +21,7 @@ _MODULES = (
     "picture_deconvolution",
     "wall_deconvolution",
     "blind_deconvolution",
-    # S
+    "blind_success",
 )
 
 

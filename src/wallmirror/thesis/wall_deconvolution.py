@@ -125,7 +125,7 @@ def non_blind(seed: int) -> ThesisFigure:
     }
     estimates: dict[tuple[str, str], Array] = {}
     for name, (kernel, data) in cases.items():
-        estimates[name, "Tikhonov"] = tikhonov_dense(toeplitz_matrix(kernel, PIXELS, mode="same"), data, _ALPHA)
+        estimates[name, "Tikhonov"] = tikhonov_lsmr(_same(kernel), data, _ALPHA)
         estimates[name, "Richardson-Lucy"] = _lucy(kernel, data)
     found = {key: find_peaks(wall.x, estimate, places) for key, estimate in estimates.items()}
     angle = _over_the_angle_sum(wall.render, brdf)
@@ -286,9 +286,7 @@ def _two_lobes() -> dict[str, Found]:
     data = _same(kernel).apply(wall.mirror)
     places = mirror_points(observer, card, card.elements_x)
     return {
-        "Tikhonov": find_peaks(
-            wall.x, tikhonov_dense(toeplitz_matrix(kernel, PIXELS, mode="same"), data, _ALPHA), places
-        ),
+        "Tikhonov": find_peaks(wall.x, tikhonov_lsmr(_same(kernel), data, _ALPHA), places),
         "Richardson-Lucy": find_peaks(wall.x, _lucy(kernel, data), places),
     }
 
