@@ -17,7 +17,7 @@ ROUNDING = 64 * float(np.finfo(np.float64).eps)
 
 
 def real_samples(values: ArrayLike, field: str, *, ndim: int | None = None) -> Array:
-    """The values in float64, whatever real type they came in.
+    """The values in float64, whatever real type they came in; float64 is not copied.
 
     Raises
     ------
@@ -27,7 +27,7 @@ def real_samples(values: ArrayLike, field: str, *, ndim: int | None = None) -> A
     given = np.asarray(values)
     if given.dtype.kind not in "biuf":
         raise InputError(f"holds {given.dtype} values; give real numbers", field=field)
-    samples = np.array(given, dtype=np.float64)
+    samples = np.asarray(given, dtype=np.float64)
     if samples.size == 0 or samples.ndim == 0:
         raise InputError(f"has shape {samples.shape}; give at least one sample along each axis", field=field)
     if ndim is not None and samples.ndim != ndim:

@@ -218,7 +218,14 @@ def adjoint_mismatch(operator: LinearOperator, *, seed: int = 0) -> float:
 
 def transform(samples: Array, grid: tuple[int, ...]) -> NDArray[np.complex128]:
     """Fourier transform of real samples, zero-padded to the grid, over all axes; the last one is halved."""
-    return np.asarray(scipy.fft.rfftn(samples, s=grid, workers=_workers(grid)))
+    workers = _workers(grid)
+    if 2 * samples.size >= math.prod(grid):
+        return np.asarray(scipy.fft.rfftn(samples, s=grid, workers=workers))
+    # A small kernel is padded one axis at a time, so that few rows of zeros are transformed.
+    spectrum = scipy.fft.rfft(samples, n=grid[-1], axis=-1, workers=workers)
+    for axis in range(samples.ndim - 1):
+        spectrum = scipy.fft.fft(spectrum, n=grid[axis], axis=axis, workers=workers, overwrite_x=True)
+    return np.asarray(spectrum)
 
 
 def inverse(spectrum: NDArray[np.complex128], grid: tuple[int, ...]) -> Array:

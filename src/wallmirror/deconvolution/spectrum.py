@@ -163,20 +163,26 @@ def convolution_spectrum(
             field="kernel",
         )
     if mode == "periodic":
-        h = np.pad(h, [(0, n - k) for n, k in zip(g.shape, h.shape, strict=True)])
-        h = np.roll(h, [-o for o in start], tuple(range(h.ndim)))
+        h = np.roll(
+            np.pad(h, [(0, n - k) for n, k in zip(g.shape, h.shape, strict=True)]),
+            [-o for o in start],
+            tuple(range(h.ndim)),
+        )
         kept = tuple(slice(None) for _ in g.shape)
     else:
         kept = tuple(slice(0, n - k + 1) for n, k in zip(g.shape, h.shape, strict=True))
     transfer, spectrum = transform(h, g.shape), transform(g, g.shape)
+    power = _squared(transfer)
+    coefficients = np.conjugate(transfer, out=transfer)
+    coefficients *= spectrum
     # The last axis holds half of the frequencies: all but the first, and the last of an even length, come in pairs.
     pairs = np.full(spectrum.shape[-1], 2.0)
     pairs[0] = 1.0
     if g.shape[-1] % 2 == 0:
         pairs[-1] = 1.0
     return Spectrum(
-        power=_squared(transfer),
-        coefficients=transfer.conj() * spectrum,
+        power=power,
+        coefficients=coefficients,
         projections=spectrum,
         projection_power=1 / g.size,
         multiplicity=pairs,
