@@ -131,7 +131,13 @@ def every_alpha(seed: int) -> ThesisFigure:
     axes = figure.add_subplot(grid[0, :])
     best = {name: int(np.argmin(values)) for name, values in errors.items()}
     for (name, values), colour in zip(errors.items(), (OURS, WARM), strict=True):
-        axes.loglog(_ALPHAS, values, color=colour, linewidth=1.4, label=f"Tikhonov, {name}")
+        axes.loglog(
+            _ALPHAS,
+            values,
+            color=colour,
+            linewidth=1.4,
+            label=f"Tikhonov, {name}" + (" (periodic)" if name == "cropped" else ""),
+        )
     for marker, (name, alpha) in zip("os^", chosen.items(), strict=True):
         axes.plot(alpha, rules[name], marker, color=INK, markersize=6, label=name, linestyle="none")
     axes.axhline(

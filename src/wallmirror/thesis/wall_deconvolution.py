@@ -178,7 +178,8 @@ def non_blind(seed: int) -> ThesisFigure:
         about="The setting of Fig. 3.3 (source at 50 m, 1,000 wall points, lobes at ±15° and ±30°), Tikhonov at alpha = 1, "
         "Richardson-Lucy 10 iterations from the data. The thesis feeds the 1-D convolution itself, made with the same "
         "kernel that is then divided out (an inverse crime); the render of Algorithm 1 is what a camera would see. Dotted: "
-        "where the mirror shows the two points. Last row: the same render put on the angle sum, where angles add.",
+        "where the mirror shows the two points. Last row: the same render put on the angle sum, where angles add; the marks "
+        "near ±40° are what the far field's error makes at the view's ends, where two of four lobes fall outside it.",
         figure=figure,
         columns={
             "x (m)": wall.x,
