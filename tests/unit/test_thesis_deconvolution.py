@@ -14,7 +14,13 @@ from wallmirror.thesis.blind_deconvolution import _exchanged, _left, _slightly_w
 from wallmirror.thesis.blind_success import KNOWLEDGE, interval, judge, random_case
 from wallmirror.thesis.picture_deconvolution import _cropping, _worse
 from wallmirror.thesis.picture_restoration import blurred_picture, psnr, sharpness, ssim
-from wallmirror.thesis.wall_deconvolution import _recovered, far_wall, find_peaks, kernel_with_holes
+from wallmirror.thesis.wall_deconvolution import (
+    _over_the_angle_sum,
+    _recovered,
+    far_wall,
+    find_peaks,
+    kernel_with_holes,
+)
 
 OBSERVER, CARD = setting.observer(1000), setting.card(50.0)
 BRDF = setting.lobes(*setting.LOBES["text"])
@@ -38,6 +44,16 @@ def test_the_published_success_is_reproduced_and_rests_on_its_holes_and_on_its_o
     assert smooth.max() < 0.2 * max(near)
     for kernel in (holes, whole):
         assert not find_peaks(wall.x, estimate(kernel, wall.render), PLACES).good
+
+
+def test_over_the_angle_sum_the_real_render_is_undone():
+    render = far_wall(BRDF).render
+    undone = _over_the_angle_sum(render, BRDF)
+    for method in ("Tikhonov", "Richardson-Lucy"):
+        assert find_peaks(undone["degrees"], undone[method], undone["places"], near=1.0).good
+    # The planted twin: another wall's lobes, by 1 deg.
+    other = _over_the_angle_sum(render, setting.lobes(-31.0, -15.0, 15.0, 30.0))
+    assert not find_peaks(other["degrees"], other["Tikhonov"], other["places"], near=0.2).good
 
 
 def test_holes_are_where_the_angles_are_further_apart_than_the_bins():
