@@ -36,6 +36,7 @@ from wallmirror.derendering.solution import Solution
 from wallmirror.derendering.solve import solve
 from wallmirror.errors import InputError, MissingRuntimeError, UndeterminedError, WallmirrorError
 from wallmirror.geometry import Card, Observer, scan_angles, wall_points
+from wallmirror.planning import Hypothesis, Plan
 from wallmirror.scene import RenderSettings, Room, Scene, Wall, load_scene, scene_names
 from wallmirror.transport import (
     Kernel,
@@ -64,14 +65,22 @@ __all__ = [
     "Forecast",
     "Fresnel",
     "GaussianTrain",
+<<<<<<< HEAD
     "GeneralSum",
+=======
+    "Hypothesis",
+>>>>>>> f7b044c (Advise what a scene needs to reach a tolerance: simplifications measured on its own films, samples foretold from small renders)
     "InputError",
     "Kernel",
     "Mirror",
     "MissingRuntimeError",
     "Observer",
     "Phong",
+<<<<<<< HEAD
     "PhongIllumination",
+=======
+    "Plan",
+>>>>>>> f7b044c (Advise what a scene needs to reach a tolerance: simplifications measured on its own films, samples foretold from small renders)
     "RenderSettings",
     "Room",
     "Scene",

@@ -133,6 +133,34 @@ def validate(
     raise typer.Exit(0 if passed else 1)
 
 
+@app.command(epilog="Example: wallmirror advise flat_wall_lobes --tolerance 0.01")
+def advise(
+    scene: Annotated[str, typer.Argument(help="A scene's name, or a .toml file.")],
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", help="Error wanted: rms over all films in units of their rms radiance.")
+    ] = 0.01,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Measure what a scene needs to reach an accuracy: which simplifications hold, and the cheapest settings."""
+    from wallmirror.jobs.advising import advise as plan_for
+    from wallmirror.jobs.advising import hypothesis_rows, percent, plan_rows
+    from wallmirror.scene import load_scene
+
+    terminal = Terminal(as_json=as_json)
+    plan = plan_for(load_scene(scene), tolerance, seed=seed, progress=terminal.note)
+    terminal.say(f"{plan.scene}: the cheapest ways to an error of {percent(tolerance)}")
+    terminal.say()
+    terminal.table(["to", "do", "error", "time here"], plan_rows(plan), words=2)
+    terminal.say()
+    terminal.table(["", "simplification", "", "error alone"], hypothesis_rows(plan), words=3)
+    terminal.say("* after the best global scale, as the formula has none of its own")
+    for note in plan.notes:
+        terminal.say(f"note: {note}")
+    terminal.document(plan.summary())
+    raise typer.Exit(0 if plan.reached else 1)
+
+
 @app.command(epilog="Example: wallmirror capture cornell_lobes -o out/box --max-depth 50")
 def capture(
     scene: Annotated[str, typer.Argument(help="A scene's name, or a .toml file.")],

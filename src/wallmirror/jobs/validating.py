@@ -166,20 +166,21 @@ def render_seeds(
     spp: int,
     seed: int = 0,
     realisation: int = 0,
+    count: int = SEEDS,
     variant: str = "llvm_ad_mono",
     progress: Advance | None = None,
 ) -> Sample:
-    """The rendered side, with parameters as for `validate_scene`."""
-    count = scene.observer.views
-    chosen = tuple(int(v) for v in np.unique(np.linspace(0, count - 1, views).round().astype(int)))
+    """The rendered side, with parameters as for `validate_scene`, and `count` seeds."""
+    last = scene.observer.views - 1
+    chosen = tuple(int(v) for v in np.unique(np.linspace(0, last, views).round().astype(int)))
     # Looking through a board displaces what is seen by a hundredth of a pixel (see `building`), which this test would
     # notice. At one bounce the board has no other effect, so it is taken away.
     bare = replace(scene, card=replace(scene.card, board_width=0.0, board_height=0.0))
     renderer = Renderer(bare, variant=variant)
-    roots = spread_seeds(seed, len(chosen) * SEEDS)
-    seeds = np.empty((SEEDS, len(chosen), scene.observer.pixels))
+    roots = spread_seeds(seed, len(chosen) * count)
+    seeds = np.empty((count, len(chosen), scene.observer.pixels))
     for a, view in enumerate(chosen):
-        mine = roots[a * SEEDS : (a + 1) * SEEDS]
+        mine = roots[a * count : (a + 1) * count]
         pattern = scene.source[:, realisation]
         render = renderer.render(view, pattern, spp=spp, seeds=mine, max_depth=2, sampler="multijitter", method="seeds")
         seeds[:, a] = render.per_seed

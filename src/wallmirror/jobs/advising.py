@@ -1,0 +1,334 @@
+"""`wallmirror advise`: what a scene needs to be predicted, filmed, validated and solved to a tolerance."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wallmirror.brdf import AngleSumBRDF, tabulate
+from wallmirror.derendering.foresight import foresee
+from wallmirror.jobs.bouncing import RR_DEPTH
+from wallmirror.jobs.piloting import NoisePilot, Truncation, pilot_gain, pilot_noise, truncations
+from wallmirror.pathtracing.building import wall_as_rendered
+from wallmirror.pathtracing.rendering import Renderer
+from wallmirror.planning.forward import cheapest_quadrature, coarsest_knots, fewest_table_nodes
+from wallmirror.planning.hypotheses import one_bounce_hypothesis, simplifications, table_error
+from wallmirror.planning.plan import (
+    AIM,
+    CapturePlan,
+    ForwardPlan,
+    Plan,
+    SolvePlan,
+    Term,
+    ValidatePlan,
+    checked_tolerance,
+)
+from wallmirror.planning.sampling import MOST_SPP, cheapest_sampling
+from wallmirror.planning.sketch import Sketch, sketch
+from wallmirror.scene import Scene
+
+Array = NDArray[np.float64]
+
+# Shares of the tolerance that bounces left out and the BRDF's table may take of a film.
+_DEPTH_SHARE = 0.5
+_TABLE_SHARE = 0.2
+# Deeper paths are ended by chance where the scene would not.
+_DEEP_FROM = 8
+_DEPTH_PIXELS = 128
+_KNOTS_SHARE = 0.3
+_FORESIGHT_SIZE = 20_000  # rows x elements that the bound of a pilot may have
+_VALIDATE_AIM = 0.75
+_VALIDATE_SPP = (64, 144, 256, 576, MOST_SPP)  # squares, as stratified samples need
+_LEAST_VIEWS = 3
+
+
+def advise(scene: Scene, tolerance: float, *, seed: int = 0, progress: Callable[[str], None] | None = None) -> Plan:
+    """Measure what a scene needs to reach a tolerance, and plan the cheapest way there.
+
+    Parameters
+    ----------
+    tolerance:
+        Relative L2 error of the films over all views, pixels and patterns, from 1e-5 to 0.5.
+    seed:
+        Root of the pilot renders' random numbers.
+    progress:
+        Called with a sentence at each stage.
+
+    Raises
+    ------
+    InputError
+        For a tolerance out of range, or a scene too large to be measured in seconds or dark.
+    """
+    started = time.perf_counter()
+    tell = progress or (lambda _: None)
+    checked_tolerance(tolerance)
+    tell("the analytic model against its simplifications")
+    drawn = sketch(scene, tolerance=tolerance)
+    rows = simplifications(drawn)
+    notes: list[str] = []
+    filmed = filmable(scene)
+    if not filmed:
+        notes.append(
+            "nothing can be rendered: a path never meets points; give the strips a width and a height and the pixels "
+            'their footprints (pixels_at = "centres")'
+        )
+    if filmed:
+        tell("light of many bounces, by a small render")
+        found = truncations(scene, _small(scene), seed=seed)
+        why = "nothing but the wall reflects" if scene.is_one_bounce else "rendered with common random numbers"
+        one = one_bounce_hypothesis(found[0].error, why)
+    else:
+        found = ()
+        one = one_bounce_hypothesis(0.0 if scene.is_one_bounce else math.nan, "nothing but the wall reflects")
+    capture = noise = None
+    if filmed:
+        tell("noise, by small renders")
+        capture, noise = _capture(scene, drawn, found, tolerance, seed)
+    forward = _forward(scene, drawn, found, capture, tolerance)
+    validation = None
+    if filmed:
+        tell("the smallest gain error that validation would see")
+        validation = _validation(scene, tolerance, seed, notes)
+    solution = None
+    if capture is not None and noise is not None:
+        tell("what noise does to the recovered pattern")
+        solution = _solution(scene, drawn, capture, noise, tolerance, notes)
+    return Plan(
+        scene=scene.name,
+        tolerance=tolerance,
+        forward=forward,
+        capture=capture,
+        validate=validation,
+        solve=solution,
+        hypotheses=(one, *rows),
+        notes=tuple(notes),
+        seconds=time.perf_counter() - started,
+    )
+
+
+def filmable(scene: Scene) -> bool:
+    """Whether paths can meet the scene's strips and pixels."""
+    return not scene.card.is_points and scene.observer.pixels_at == "centres"
+
+
+def as_planned(scene: Scene, plan: CapturePlan) -> Scene:
+    """The scene with the BRDF's table that a plan asks for."""
+    brdf = scene.wall.brdf
+    if plan.table_nodes is None or not isinstance(brdf, AngleSumBRDF):
+        return scene
+    return replace(scene, wall=replace(scene.wall, brdf=tabulate(brdf, plan.table_nodes)))
+
+
+def _small(scene: Scene) -> Renderer:
+    pixels = min(_DEPTH_PIXELS, scene.observer.pixels)
+    return Renderer(replace(scene, observer=replace(scene.observer, pixels=pixels)))
+
+
+def _forward(
+    scene: Scene, drawn: Sketch, found: tuple[Truncation, ...], capture: CapturePlan | None, tolerance: float
+) -> ForwardPlan:
+    left_out = found[0] if found else Truncation(2, 0.0, 0.0)
+    enough = left_out.upper < _DEPTH_SHARE * tolerance
+    quadrature = cheapest_quadrature(
+        drawn, tolerance=AIM * tolerance - (left_out.upper if enough else 0.0), views=scene.observer.views
+    )
+    terms = (
+        Term(name="bounces left out", error=left_out.error, kind="bias"),
+        Term(name="quadrature", error=quadrature.error, kind="bias"),
+    )
+    if enough or capture is None:
+        return ForwardPlan(route="analytic", quadrature=quadrature, terms=terms, seconds=quadrature.seconds)
+    return ForwardPlan(route="path tracing", quadrature=quadrature, terms=capture.terms, seconds=capture.seconds)
+
+
+def _capture(
+    scene: Scene, drawn: Sketch, found: tuple[Truncation, ...], tolerance: float, seed: int
+) -> tuple[CapturePlan, NoisePilot]:
+    depth = next(t for t in found if t.upper <= _DEPTH_SHARE * tolerance)
+    rr_depth = scene.render.rr_depth if depth.depth < _DEEP_FROM else min(RR_DEPTH, scene.render.rr_depth)
+    nodes, table = _table(scene, drawn, tolerance)
+    noise = pilot_noise(scene, Renderer(scene), max_depth=depth.depth, rr_depth=rr_depth, seed=seed)
+    bias = depth.error + table
+    aim = math.sqrt((AIM * tolerance) ** 2 - min(bias, 0.7 * tolerance) ** 2)
+    sampling = cheapest_sampling(noise.levels, noise=aim)
+    terms = (
+        Term(name="bounces left out", error=depth.error, kind="bias"),
+        Term(name="BRDF table", error=table, kind="bias"),
+        Term(name="noise", error=sampling.noise, kind="noise"),
+    )
+    films = scene.observer.views * scene.source.shape[1]
+    plan = CapturePlan(
+        sampling=sampling,
+        max_depth=depth.depth,
+        rr_depth=rr_depth,
+        table_nodes=nodes,
+        films=films,
+        terms=terms,
+    )
+    return plan, noise
+
+
+def _table(scene: Scene, drawn: Sketch, tolerance: float) -> tuple[int | None, float]:
+    """Nodes of the BRDF's table, None where the renderer's own are enough, and the error that they make."""
+    rendered = wall_as_rendered(scene)
+    nodes = np.size(getattr(rendered, "values", ()))
+    if nodes == 0 or rendered is scene.wall.brdf or not isinstance(scene.wall.brdf, AngleSumBRDF):
+        return None, 0.0
+    error = table_error(drawn, nodes)
+    if error <= _TABLE_SHARE * tolerance:
+        return None, error
+    finer = fewest_table_nodes(drawn, tolerance=_TABLE_SHARE * tolerance)
+    return (None, error) if finer is None else finer
+
+
+def _validation(scene: Scene, tolerance: float, seed: int, notes: list[str]) -> ValidatePlan | None:
+    levels = pilot_gain(scene, seed=seed)
+    best = levels[-1]
+    each = 0.0
+    if len(levels) > 1:
+        each = max(0.0, (best.seconds - levels[0].seconds) / (best.spp - levels[0].spp))
+    each = each or best.seconds / best.spp
+    start = max(0.0, best.seconds - each * best.spp)
+    options = []
+    for spp in _VALIDATE_SPP:
+        # Between pilots and beyond them noise falls at least as fast as that of independent samples.
+        known = next((level for level in reversed(levels) if level.spp <= spp), levels[0])
+        one = known.detectable * math.sqrt(known.spp / spp)
+        views = max(_LEAST_VIEWS, math.ceil((one / (_VALIDATE_AIM * tolerance)) ** 2))
+        views = min(views, scene.observer.views)
+        detectable = one / math.sqrt(views)
+        options.append(ValidatePlan(views=views, spp=spp, detectable=detectable, seconds=views * (start + each * spp)))
+    reaching = [o for o in options if o.detectable <= _VALIDATE_AIM * tolerance]
+    if reaching:
+        return min(reaching, key=lambda o: o.seconds)
+    finest = min(options, key=lambda o: o.detectable)
+    notes.append(
+        f"validation cannot see a gain error of {tolerance:g} here: all {finest.views} views with {finest.spp} samples see "
+        f"{finest.detectable:.1e}"
+    )
+    return None
+
+
+def _solution(
+    scene: Scene, drawn: Sketch, capture: CapturePlan, noise: NoisePilot, tolerance: float, notes: list[str]
+) -> SolvePlan | None:
+    brdf = scene.wall.brdf
+    if not isinstance(brdf, AngleSumBRDF):
+        notes.append("nothing to solve for: the wall's BRDF is no function of the angle sum that a solver could find")
+        return None
+    observer, card = scene.observer, scene.card
+    rank = int(np.linalg.matrix_rank(scene.source))
+    if rank < card.elements:
+        notes.append(
+            f"{rank} independent patterns cannot determine {card.elements} elements; give the scene at least as many"
+        )
+        return None
+    fewer = max(1, _FORESIGHT_SIZE // (observer.pixels * card.elements))
+    keep = np.unique(np.linspace(0, len(noise.views) - 1, min(fewer, len(noise.views))).round().astype(int))
+    views = [noise.views[k] for k in keep]
+    std = noise.std[keep]
+    # What no sample found has a noise all the same.
+    std = np.maximum(std, 1e-2 * float(std.max()))
+    # The pilot's noise has the shape, the plan's sampling the size.
+    size = capture.sampling.noise / noise.relative()
+    forecast = foresee(
+        replace(observer, view_angles=tuple(observer.view_angles[v] for v in views)),
+        card,
+        brdf,
+        scene.source[:, list(noise.patterns)],
+        noise=size * std,
+    )
+    error = forecast.source_error * math.sqrt(len(views) / observer.views)
+    knots = coarsest_knots(drawn, tolerance=_KNOTS_SHARE * tolerance)
+    assert knots is not None
+    needed = capture.sampling.total * (error / (AIM * tolerance)) ** 2
+    if not scene.is_one_bounce:
+        notes.append(
+            "the solver assumes one bounce; what light beyond it does to the pattern, no samples mend, and `wallmirror "
+            "solve` foretells it"
+        )
+    return SolvePlan(
+        source_error=error,
+        samples_per_pixel=math.ceil(needed) if math.isfinite(needed) else 0,
+        step_deg=knots[0],
+        knots_error=knots[1],
+        quadrature_tolerance=min(1e-3, 1e-2 * tolerance),
+        patterns=(rank, card.elements),
+    )
+
+
+def plan_rows(plan: Plan) -> list[list[str]]:
+    """What to do, with which settings, to which predicted error and in which predicted time: a row for each task."""
+    forward, capture, validation, solution = plan.forward, plan.capture, plan.validate, plan.solve
+    rows = []
+    if forward.route == "analytic":
+        rows.append(
+            [
+                "predict the wall",
+                f"analytic, one bounce; {_nodes(forward)}",
+                percent(forward.error),
+                _time(forward.seconds),
+            ]
+        )
+    else:
+        assert capture is not None
+        text = f"path tracing as for capture: one bounce leaves out {percent(plan.hypothesis('one bounce').error)}"
+        rows.append(["predict the wall", text, percent(forward.error), _time(forward.seconds)])
+    if capture is not None:
+        s = capture.sampling
+        seeds = f"{s.seeds} seeds x {s.spp}" if s.seeds > 1 else f"{s.spp}"
+        table = "" if capture.table_nodes is None else f", BRDF table of {capture.table_nodes} nodes"
+        text = f"depth {capture.max_depth}, {seeds} {s.sampler} samples a pixel{table}"
+        rows.append(["capture", text, percent(capture.error), _time(capture.seconds)])
+    if validation is not None:
+        text = f"{validation.views} views, 32 seeds x {validation.spp} samples; sees gain errors from"
+        rows.append(["validate", text, percent(validation.detectable), _time(validation.seconds)])
+    if solution is not None:
+        text = f"of that capture: BRDF knots every {solution.step_deg:g} deg or finer; noise in the pattern"
+        rows.append(["solve", text, percent(solution.source_error), ""])
+    return rows
+
+
+def hypothesis_rows(plan: Plan) -> list[list[str]]:
+    """Each hypothesis with its error in this scene's films, and whether it holds."""
+    rows = []
+    for h in plan.hypotheses:
+        known = not math.isnan(h.error)
+        answer = "-" if not known else "holds" if h.holds(plan.tolerance) else "fails"
+        size = "unknown" if not known else "exact" if h.error == 0 else percent(h.error) + (" *" if h.scaled else "")
+        rows.append([h.label, h.says, answer, size])
+    return rows
+
+
+def percent(error: float) -> str:
+    """A relative error for people: in percent, or as a multiple where it is more than the whole."""
+    if not math.isfinite(error):
+        return "unbounded"
+    if error >= 1.995:
+        return f"{error:.2g} times" if error < 100 else f"{error:.0f} times"
+    return f"{100 * error:.0f} %" if error >= 0.0995 else f"{100 * error:.2g} %"
+
+
+def _nodes(forward: ForwardPlan) -> str:
+    q = forward.quadrature
+    if q.strips == "exact":
+        return "a mirror, exact"
+    pixel = "pixels as points" if q.across_pixel == 1 else f"{q.across_pixel} nodes a pixel"
+    if q.strips == "points":
+        return f"strips as points, {pixel}"
+    strip = "strips without width" if q.across_strip == 1 else f"{q.across_strip} nodes a strip"
+    return f"{strip}, {pixel}"
+
+
+def _time(seconds: float) -> str:
+    if seconds < 1:
+        return f"{1000 * max(seconds, 1e-3):.0f} ms"
+    for unit, size in (("s", 1.0), ("min", 60.0), ("h", 3600.0)):
+        if seconds < 120 * size:
+            return f"{seconds / size:.2g} {unit}" if seconds / size < 10 else f"{seconds / size:.0f} {unit}"
+    return f"{seconds / 86400:.0f} days"

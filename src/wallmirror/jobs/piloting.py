@@ -1,0 +1,228 @@
+"""Small renders from which the cost of large ones is foretold: what shallow paths leave out, noise, and the gain's scatter."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wallmirror.comparison import detectable_gain
+from wallmirror.jobs.bouncing import DEEP, RR_DEPTH, spread
+from wallmirror.jobs.validating import SEEDS, expect, render_seeds
+from wallmirror.pathtracing.rendering import Renderer, largest_pass, spread_seeds
+from wallmirror.planning.sampling import MOST_SPP, NoiseLevel, Sampler
+from wallmirror.scene import Scene
+
+Array = NDArray[np.float64]
+
+# Samples that one part of the pilot may take, and its seeds.
+_SAMPLES = 2_000_000
+_INDEPENDENT_SPP = 64
+_INDEPENDENT_FILMS = 32
+_STRATIFIED_SPP = (16, 64, 256, 1024)
+_STRATIFIED_FILMS = 3
+_STRATIFIED_SEEDS = 4
+_DEPTH_PIXELS = 128
+_DEPTH_SPP = 256
+_DEPTH_SEEDS = 4
+_OPEN_DEPTHS = (2, 4, 6, 8, 12)  # in the open only odd numbers of bounces reach the camera
+_ROOM_DEPTHS = (2, 3, 4, 6, 8, 12)
+_GAIN_SPP = (36, 144)
+_GAIN_SEEDS = 8
+_GAIN_VIEWS = 3
+
+
+@dataclass(frozen=True)
+class Truncation:
+    """What paths of one depth leave out: relative L2 error of the films, and its upper 99 % limit."""
+
+    depth: int
+    error: float
+    upper: float
+
+
+def truncations(scene: Scene, renderer: Renderer, *, seed: int) -> tuple[Truncation, ...]:
+    """The error of each depth up to DEEP, which stands for all bounces, from differences with common random numbers.
+
+    Parameters
+    ----------
+    renderer:
+        Of the scene with at most 128 pixels, whose films are wider but not darker.
+    """
+    if scene.is_one_bounce:
+        return (Truncation(2, 0.0, 0.0),)
+    depths = (*(_OPEN_DEPTHS if scene.room is None else _ROOM_DEPTHS), DEEP)
+    films = [(v, b) for v in spread(scene.observer.views, 2) for b in spread(scene.source.shape[1], 2)]
+    roots = spread_seeds(seed, len(films) * _DEPTH_SEEDS)
+    light = np.empty((len(depths), _DEPTH_SEEDS, len(films), renderer.scene.observer.pixels))
+    for f, (view, pattern) in enumerate(films):
+        seeds = roots[f * _DEPTH_SEEDS : (f + 1) * _DEPTH_SEEDS]
+        for d, depth in enumerate(depths):
+            render = renderer.render(
+                view,
+                scene.source[:, pattern],
+                spp=_DEPTH_SPP,
+                seeds=seeds,
+                max_depth=depth,
+                rr_depth=RR_DEPTH,
+                sampler="multijitter",
+                method="seeds",
+            )
+            light[d, :, f] = render.per_seed
+    return truncations_of(depths, light.reshape(len(depths), _DEPTH_SEEDS, -1))
+
+
+def truncations_of(depths: Sequence[int], light: Array) -> tuple[Truncation, ...]:
+    """The errors from the light of each depth and seed, shape (D, S, P); the last depth stands for all bounces.
+
+    The square of a norm is taken between different seeds, so that noise adds nothing to it.
+    """
+    whole = _cross_square(light[-1])[0]
+    found = []
+    for depth, film in zip(depths[:-1], light[:-1], strict=True):
+        square, error = _cross_square(light[-1] - film)
+        upper = math.sqrt(max(0.0, square + 2.6 * error) / whole)
+        found.append(Truncation(depth, math.sqrt(max(0.0, square) / whole), upper))
+    return (*found, Truncation(depths[-1], 0.0, 0.0))
+
+
+def _cross_square(films: Array) -> tuple[float, float]:
+    """|E film|^2 without the noise's own square, from seeds (S, P), and its standard error by the jackknife."""
+    seeds = films.shape[0]
+    gram = films @ films.T
+    off = gram.sum() - np.trace(gram)
+    value = off / (seeds * (seeds - 1))
+    without = (off - 2 * (gram.sum(axis=1) - np.diag(gram))) / ((seeds - 1) * (seeds - 2))
+    error = math.sqrt((seeds - 1) / seeds * float(np.sum((without - without.mean()) ** 2)))
+    return float(value), error
+
+
+@dataclass(frozen=True)
+class NoisePilot:
+    """Noise of small renders of one scene at one depth.
+
+    Parameters
+    ----------
+    levels:
+        For `cheapest_sampling`.
+    views, patterns:
+        The films behind `std`.
+    std:
+        Standard deviation of the radiance for one independent sample per pixel, shape (A', N, B').
+    """
+
+    levels: tuple[NoiseLevel, ...]
+    views: tuple[int, ...]
+    patterns: tuple[int, ...]
+    std: Array = field(repr=False)
+
+    def relative(self) -> float:
+        """Rms noise of one independent sample over the rms radiance."""
+        return next(level.noise * math.sqrt(level.spp) for level in self.levels if level.sampler == "independent")
+
+
+@dataclass(frozen=True)
+class _Film:
+    """One film of a pilot: noise-free square of its radiance, variance of one seed, each (N,), and seconds of a seed."""
+
+    square: Array
+    variance: Array
+    seconds: float
+
+
+class _Camera:
+    """Renders films of one scene at one depth, each with seeds of its own."""
+
+    def __init__(self, scene: Scene, renderer: Renderer, *, max_depth: int, rr_depth: int, seed: int) -> None:
+        self._scene, self._renderer, self._depths = scene, renderer, (max_depth, rr_depth)
+        self._first, self._used = spread_seeds(seed, 1)[0], 0
+
+    def film(self, view: int, pattern: int, sampler: Sampler, spp: int, seeds: int) -> _Film:
+        mine = [(self._first + self._used + k) % 2**32 for k in range(seeds)]
+        self._used += seeds
+        started = time.perf_counter()
+        made = self._renderer.render(
+            view,
+            self._scene.source[:, pattern],
+            spp=spp,
+            seeds=mine,
+            max_depth=self._depths[0],
+            rr_depth=self._depths[1],
+            sampler=sampler,
+        )
+        seconds = (time.perf_counter() - started) / seeds
+        return _Film(made.mean**2 - made.variance, made.variance * seeds, seconds)
+
+
+def pilot_noise(scene: Scene, renderer: Renderer, *, max_depth: int, rr_depth: int, seed: int) -> NoisePilot:
+    """Render a few films with few samples, independent and stratified."""
+    pixels, realisations = scene.observer.pixels, scene.source.shape[1]
+    most = min(MOST_SPP, largest_pass(pixels))
+    spp = min(_INDEPENDENT_SPP, most)
+    films = max(1, min(_INDEPENDENT_FILMS, _SAMPLES // (spp * pixels)))
+    patterns = spread(realisations, max(1, min(realisations, films, 2 * scene.card.elements)))
+    views = spread(scene.observer.views, max(1, min(scene.observer.views, films // len(patterns))))
+    camera = _Camera(scene, renderer, max_depth=max_depth, rr_depth=rr_depth, seed=seed)
+    camera.film(views[0], patterns[0], "independent", spp, 1)  # compiles
+    made = [[camera.film(view, pattern, "independent", spp, 1) for pattern in patterns] for view in views]
+    level = _level("independent", spp, [film for line in made for film in line])
+    longer = camera.film(views[0], patterns[0], "independent", most, 1).seconds
+    levels = [level]
+    if most > spp:
+        levels.append(replace(level, spp=most, noise=level.noise * math.sqrt(spp / most), seconds=longer))
+    chosen = [(v, patterns[k % len(patterns)]) for k, v in enumerate(spread(scene.observer.views, _STRATIFIED_FILMS))]
+    camera.film(*chosen[0], "multijitter", _STRATIFIED_SPP[0], 2)
+    for stratified in _STRATIFIED_SPP:
+        seeds = min(_STRATIFIED_SEEDS, _SAMPLES // (len(chosen) * stratified * pixels))
+        if stratified > most or seeds < 2:
+            break
+        several = [camera.film(view, pattern, "multijitter", stratified, seeds) for view, pattern in chosen]
+        levels.append(_level("multijitter", stratified, several))
+    std = np.sqrt(spp * np.array([[film.variance for film in line] for line in made]))
+    return NoisePilot(tuple(levels), views, patterns, std.transpose(0, 2, 1))
+
+
+def _level(sampler: Sampler, spp: int, films: Sequence[_Film]) -> NoiseLevel:
+    variance, square = (sum(float(getattr(film, name).sum()) for film in films) for name in ("variance", "square"))
+    return NoiseLevel(
+        sampler=sampler,
+        spp=spp,
+        noise=math.sqrt(variance / max(square, 1e-300)),
+        seconds=float(np.median([film.seconds for film in films])),
+    )
+
+
+@dataclass(frozen=True)
+class GainLevel:
+    """Smallest gain error that `validate` would reject with one view and its 32 seeds of `spp` samples, and the cost."""
+
+    spp: int
+    detectable: float
+    seconds: float
+
+
+def pilot_gain(scene: Scene, *, seed: int) -> tuple[GainLevel, ...]:
+    """Foretell what `validate` can see from a few seeds of a few views, the fewest samples first."""
+    found: list[GainLevel] = []
+    render_seeds(scene, views=1, spp=_GAIN_SPP[0], seed=seed, count=2)  # compiles
+    for spp in _GAIN_SPP:
+        if found and spp * _GAIN_SEEDS * _GAIN_VIEWS * scene.observer.pixels > _SAMPLES:
+            break
+        started = time.perf_counter()
+        sample = render_seeds(scene, views=_GAIN_VIEWS, spp=spp, seed=seed, count=_GAIN_SEEDS)
+        seconds = (time.perf_counter() - started) / (len(sample.views) * _GAIN_SEEDS)
+        if not found:
+            expectation = expect(scene, sample.views)
+        detectable = detectable_gain(
+            sample.seeds,
+            expectation.reference,
+            planned=SEEDS,
+            templates=len(expectation.templates),
+            edges=expectation.edges,
+        )
+        found.append(GainLevel(spp, detectable * math.sqrt(len(sample.views)), SEEDS * seconds))
+    return tuple(found)
