@@ -65,22 +65,16 @@ __all__ = [
     "Forecast",
     "Fresnel",
     "GaussianTrain",
-<<<<<<< HEAD
     "GeneralSum",
-=======
     "Hypothesis",
->>>>>>> f7b044c (Advise what a scene needs to reach a tolerance: simplifications measured on its own films, samples foretold from small renders)
     "InputError",
     "Kernel",
     "Mirror",
     "MissingRuntimeError",
     "Observer",
     "Phong",
-<<<<<<< HEAD
     "PhongIllumination",
-=======
     "Plan",
->>>>>>> f7b044c (Advise what a scene needs to reach a tolerance: simplifications measured on its own films, samples foretold from small renders)
     "RenderSettings",
     "Room",
     "Scene",

@@ -271,18 +271,6 @@ def cross_weights(seeds: Array, reference: Array) -> Array:
     return weights
 
 
-<<<<<<< HEAD
-def _beyond(values: Array, slack: Array) -> Array:
-    """What of the values lies beyond +-slack, with their signs."""
-    return np.asarray(np.sign(values) * np.maximum(np.abs(values) - slack, 0.0), dtype=np.float64)
-
-
-def _bias(name: str, unit: str, deviation: Array, shape: Array, weights: Array, slack: Array, level: float) -> BiasTest:
-    """Least-squares amplitude of a template in each seed; no seed has a say in its own weights, (S, A, N).
-
-    What deviations of `slack` (A, N), float32's own, can make of the amplitude at most is no bias.
-    """
-=======
 def detectable_gain(
     seeds: Array,
     reference: Array,
@@ -319,9 +307,16 @@ def detectable_gain(
     return max(1e-5 if error < 1e-6 else 0.0, _units(SIGNIFICANCE / (templates + 3), planned) * error)
 
 
-def _bias(name: str, unit: str, deviation: Array, shape: Array, weights: Array, level: float) -> BiasTest:
-    """Least-squares amplitude of a template in each seed; no seed has a say in its own weights, (S, A, N)."""
->>>>>>> f7b044c (Advise what a scene needs to reach a tolerance: simplifications measured on its own films, samples foretold from small renders)
+def _beyond(values: Array, slack: Array) -> Array:
+    """What of the values lies beyond +-slack, with their signs."""
+    return np.asarray(np.sign(values) * np.maximum(np.abs(values) - slack, 0.0), dtype=np.float64)
+
+
+def _bias(name: str, unit: str, deviation: Array, shape: Array, weights: Array, slack: Array, level: float) -> BiasTest:
+    """Least-squares amplitude of a template in each seed; no seed has a say in its own weights, (S, A, N).
+
+    What deviations of `slack` (A, N), float32's own, can make of the amplitude at most is no bias.
+    """
     power = np.einsum("san,an->s", weights, shape * shape)
     if not np.all(power > 0):
         return BiasTest(name, unit, 0.0, math.inf, (-math.inf, math.inf), 1.0, math.inf)

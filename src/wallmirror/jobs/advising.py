@@ -6,18 +6,20 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wallmirror.brdf import AngleSumBRDF, tabulate
+from wallmirror.brdf import AngleSumBRDF
 from wallmirror.derendering.foresight import foresee
+from wallmirror.errors import InputError
 from wallmirror.jobs.bouncing import RR_DEPTH
 from wallmirror.jobs.piloting import NoisePilot, Truncation, pilot_gain, pilot_noise, truncations
 from wallmirror.pathtracing.building import wall_as_rendered
 from wallmirror.pathtracing.rendering import Renderer
 from wallmirror.planning.forward import cheapest_quadrature, coarsest_knots, fewest_table_nodes
-from wallmirror.planning.hypotheses import one_bounce_hypothesis, simplifications, table_error
+from wallmirror.planning.hypotheses import Hypothesis, one_bounce_hypothesis, simplifications, table_error
 from wallmirror.planning.plan import (
     AIM,
     CapturePlan,
@@ -34,6 +36,10 @@ from wallmirror.scene import Scene
 
 Array = NDArray[np.float64]
 
+_POINTS = (
+    "nothing can be rendered: a path never meets points; give the strips a width and a height and the pixels their "
+    'footprints (pixels_at = "centres")'
+)
 # Shares of the tolerance that bounces left out and the BRDF's table may take of a film.
 _DEPTH_SHARE = 0.5
 _TABLE_SHARE = 0.2
@@ -47,13 +53,27 @@ _VALIDATE_SPP = (64, 144, 256, 576, MOST_SPP)  # squares, as stratified samples 
 _LEAST_VIEWS = 3
 
 
-def advise(scene: Scene, tolerance: float, *, seed: int = 0, progress: Callable[[str], None] | None = None) -> Plan:
+#: What a plan can be asked for.
+Part = Literal["forward", "capture", "validate", "solve"]
+ALL_PARTS: tuple[Part, ...] = ("forward", "capture", "validate", "solve")
+
+
+def advise(
+    scene: Scene,
+    tolerance: float,
+    *,
+    parts: tuple[Part, ...] = ALL_PARTS,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> Plan:
     """Measure what a scene needs to reach a tolerance, and plan the cheapest way there.
 
     Parameters
     ----------
     tolerance:
         Relative L2 error of the films over all views, pixels and patterns, from 1e-5 to 0.5.
+    parts:
+        What to plan. "forward" and "solve" ask about the films of "capture", and bring it along.
     seed:
         Root of the pilot renders' random numbers.
     progress:
@@ -67,37 +87,29 @@ def advise(scene: Scene, tolerance: float, *, seed: int = 0, progress: Callable[
     started = time.perf_counter()
     tell = progress or (lambda _: None)
     checked_tolerance(tolerance)
-    tell("the analytic model against its simplifications")
-    drawn = sketch(scene, tolerance=tolerance)
-    rows = simplifications(drawn)
     notes: list[str] = []
     filmed = filmable(scene)
     if not filmed:
-        notes.append(
-            "nothing can be rendered: a path never meets points; give the strips a width and a height and the pixels "
-            'their footprints (pixels_at = "centres")'
-        )
-    if filmed:
-        tell("light of many bounces, by a small render")
-        found = truncations(scene, _small(scene), seed=seed)
-        why = "nothing but the wall reflects" if scene.is_one_bounce else "rendered with common random numbers"
-        one = one_bounce_hypothesis(found[0].error, why)
-    else:
-        found = ()
-        one = one_bounce_hypothesis(0.0 if scene.is_one_bounce else math.nan, "nothing but the wall reflects")
-    capture = noise = None
-    if filmed:
-        tell("noise, by small renders")
-        capture, noise = _capture(scene, drawn, found, tolerance, seed)
-    forward = _forward(scene, drawn, found, capture, tolerance)
-    validation = None
-    if filmed:
+        notes.append(_POINTS)
+    forward = capture = validation = solution = None
+    hypotheses: tuple[Hypothesis, ...] = ()
+    if set(parts) != {"validate"}:
+        tell("the analytic model against its simplifications")
+        drawn = sketch(scene, tolerance=tolerance)
+        found: tuple[Truncation, ...] = ()
+        if filmed:
+            tell("light of many bounces and noise, by small renders")
+            found = truncations(scene, _small(scene), seed=seed)
+            capture, noise = _capture(scene, drawn, found, tolerance, seed)
+            if "solve" in parts:
+                tell("what noise does to the recovered pattern")
+                solution = _solution(scene, drawn, capture, noise, tolerance, notes)
+        if "forward" in parts:
+            forward = _forward(scene, drawn, found, capture, tolerance)
+            hypotheses = (_one_bounce(scene, found), *simplifications(drawn))
+    if filmed and "validate" in parts:
         tell("the smallest gain error that validation would see")
         validation = _validation(scene, tolerance, seed, notes)
-    solution = None
-    if capture is not None and noise is not None:
-        tell("what noise does to the recovered pattern")
-        solution = _solution(scene, drawn, capture, noise, tolerance, notes)
     return Plan(
         scene=scene.name,
         tolerance=tolerance,
@@ -105,23 +117,44 @@ def advise(scene: Scene, tolerance: float, *, seed: int = 0, progress: Callable[
         capture=capture,
         validate=validation,
         solve=solution,
-        hypotheses=(one, *rows),
+        hypotheses=hypotheses,
         notes=tuple(notes),
         seconds=time.perf_counter() - started,
     )
 
 
+def _one_bounce(scene: Scene, found: tuple[Truncation, ...]) -> Hypothesis:
+    """Hypothesis 2 with what one bounce leaves out here."""
+    if scene.is_one_bounce:
+        return one_bounce_hypothesis(0.0, "nothing but the wall reflects")
+    if not found:
+        return one_bounce_hypothesis(math.nan, "points cannot be rendered")
+    return one_bounce_hypothesis(found[0].error, "rendered with common random numbers")
+
+
+def plan_capture(scene: Scene, tolerance: float, *, seed: int = 0) -> CapturePlan:
+    """The plan for films of a scene to a tolerance.
+
+    Raises
+    ------
+    InputError
+        As `advise`, and where the scene cannot be rendered or no samples would reach the tolerance.
+    """
+    plan = advise(scene, tolerance, parts=("capture",), seed=seed)
+    if plan.capture is None:
+        raise InputError(plan.notes[0], field=scene.name)
+    if plan.capture.error > tolerance:
+        worst = max(plan.capture.terms, key=lambda term: term.error)
+        raise InputError(
+            f"is {tolerance:g}, which films of this scene cannot reach: {worst.name} alone is {worst.error:.1e}",
+            field="--tolerance",
+        )
+    return plan.capture
+
+
 def filmable(scene: Scene) -> bool:
     """Whether paths can meet the scene's strips and pixels."""
     return not scene.card.is_points and scene.observer.pixels_at == "centres"
-
-
-def as_planned(scene: Scene, plan: CapturePlan) -> Scene:
-    """The scene with the BRDF's table that a plan asks for."""
-    brdf = scene.wall.brdf
-    if plan.table_nodes is None or not isinstance(brdf, AngleSumBRDF):
-        return scene
-    return replace(scene, wall=replace(scene.wall, brdf=tabulate(brdf, plan.table_nodes)))
 
 
 def _small(scene: Scene) -> Renderer:
@@ -186,7 +219,7 @@ def _table(scene: Scene, drawn: Sketch, tolerance: float) -> tuple[int | None, f
     return (None, error) if finer is None else finer
 
 
-def _validation(scene: Scene, tolerance: float, seed: int, notes: list[str]) -> ValidatePlan | None:
+def _validation(scene: Scene, tolerance: float, seed: int, notes: list[str]) -> ValidatePlan:
     levels = pilot_gain(scene, seed=seed)
     best = levels[-1]
     each = 0.0
@@ -207,11 +240,12 @@ def _validation(scene: Scene, tolerance: float, seed: int, notes: list[str]) -> 
     if reaching:
         return min(reaching, key=lambda o: o.seconds)
     finest = min(options, key=lambda o: o.detectable)
-    notes.append(
-        f"validation cannot see a gain error of {tolerance:g} here: all {finest.views} views with {finest.spp} samples see "
-        f"{finest.detectable:.1e}"
-    )
-    return None
+    if finest.detectable > tolerance:
+        notes.append(
+            f"validate sees gain errors from {finest.detectable:.1e} at most, with all {finest.views} views and the most "
+            "samples that the film adds exactly enough; it would have to fail"
+        )
+    return finest
 
 
 def _solution(
@@ -266,7 +300,7 @@ def plan_rows(plan: Plan) -> list[list[str]]:
     """What to do, with which settings, to which predicted error and in which predicted time: a row for each task."""
     forward, capture, validation, solution = plan.forward, plan.capture, plan.validate, plan.solve
     rows = []
-    if forward.route == "analytic":
+    if forward is not None and forward.route == "analytic":
         rows.append(
             [
                 "predict the wall",
@@ -275,16 +309,11 @@ def plan_rows(plan: Plan) -> list[list[str]]:
                 _time(forward.seconds),
             ]
         )
-    else:
-        assert capture is not None
+    elif forward is not None:
         text = f"path tracing as for capture: one bounce leaves out {percent(plan.hypothesis('one bounce').error)}"
         rows.append(["predict the wall", text, percent(forward.error), _time(forward.seconds)])
     if capture is not None:
-        s = capture.sampling
-        seeds = f"{s.seeds} seeds x {s.spp}" if s.seeds > 1 else f"{s.spp}"
-        table = "" if capture.table_nodes is None else f", BRDF table of {capture.table_nodes} nodes"
-        text = f"depth {capture.max_depth}, {seeds} {s.sampler} samples a pixel{table}"
-        rows.append(["capture", text, percent(capture.error), _time(capture.seconds)])
+        rows.append(["capture", _settings(capture), percent(capture.error), _time(capture.seconds)])
     if validation is not None:
         text = f"{validation.views} views, 32 seeds x {validation.spp} samples; sees gain errors from"
         rows.append(["validate", text, percent(validation.detectable), _time(validation.seconds)])
@@ -292,6 +321,18 @@ def plan_rows(plan: Plan) -> list[list[str]]:
         text = f"of that capture: BRDF knots every {solution.step_deg:g} deg or finer; noise in the pattern"
         rows.append(["solve", text, percent(solution.source_error), ""])
     return rows
+
+
+def capture_line(plan: CapturePlan) -> str:
+    """A plan's settings with its predicted error and time, in one line."""
+    return f"{_settings(plan)}; predicted error {percent(plan.error)}, time {_time(plan.seconds)}"
+
+
+def _settings(plan: CapturePlan) -> str:
+    s = plan.sampling
+    seeds = f"{s.seeds} seeds x {s.spp}" if s.seeds > 1 else f"{s.spp}"
+    table = "" if plan.table_nodes is None else f", BRDF table of {plan.table_nodes} nodes"
+    return f"depth {plan.max_depth}, {seeds} {s.sampler} samples a pixel{table}"
 
 
 def hypothesis_rows(plan: Plan) -> list[list[str]]:

@@ -170,7 +170,8 @@ class Plan:
         Relative L2 error of the films, over all views, pixels and patterns: rms of the difference from the converged
         radiance in units of its rms. For `solve` it is the relative error of the pattern, for `validate` that of the gain.
     forward, capture, validate, solve:
-        What each asks for; None where the scene has no such thing, with the reason in `notes`.
+        What each asks for; None where it was not asked for, or where the scene has no such thing, with the reason in
+        `notes`.
     hypotheses:
         The thesis's, and the formula's simplifications, with the error of each alone.
     notes:
@@ -181,7 +182,7 @@ class Plan:
 
     scene: str
     tolerance: float
-    forward: ForwardPlan
+    forward: ForwardPlan | None
     capture: CapturePlan | None
     validate: ValidatePlan | None
     solve: SolvePlan | None
@@ -192,7 +193,7 @@ class Plan:
     @property
     def reached(self) -> bool:
         """Whether the forward plan is predicted to keep the tolerance."""
-        return self.forward.error <= self.tolerance
+        return self.forward is not None and self.forward.error <= self.tolerance
 
     def hypothesis(self, key: str) -> Hypothesis:
         """The hypothesis of that key."""
@@ -205,11 +206,7 @@ class Plan:
             "tolerance": self.tolerance,
             "error_is": "rms over views, pixels and patterns of the difference, over the rms radiance",
             "reached": self.reached,
-            "forward": {
-                "route": self.forward.route,
-                "quadrature": self.forward.quadrature.summary(),
-                **_budget(self.forward.terms, self.forward.seconds),
-            },
+            "forward": None if self.forward is None else _forward(self.forward),
             "capture": None if self.capture is None else _capture(self.capture),
             "validate": None if self.validate is None else dict(vars(self.validate)),
             "solve": None if self.solve is None else _solve(self.solve),
@@ -240,6 +237,11 @@ def _budget(terms: tuple[Term, ...], seconds: float) -> dict[str, Any]:
         "terms": [dict(vars(term)) for term in terms],
         "seconds": seconds,
     }
+
+
+def _forward(plan: ForwardPlan) -> dict[str, Any]:
+    budget = _budget(plan.terms, plan.seconds)
+    return {"route": plan.route, "quadrature": plan.quadrature.summary(), **budget}
 
 
 def _capture(plan: CapturePlan) -> dict[str, Any]:
