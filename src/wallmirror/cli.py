@@ -237,6 +237,10 @@ def solve(
     source_level: Annotated[
         float | None, typer.Option(help="The pattern's mean radiance, if known, for --scale level.")
     ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(help="Error of the pattern that is good enough; exit 1 where the answer is not known so well."),
+    ] = None,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -258,6 +262,7 @@ def solve(
         scale=scale,  # type: ignore[arg-type]
         wall_albedo=wall_albedo,
         source_level=source_level,
+        tolerance=tolerance,
         seed=seed,
     )
     if solved.calibration is not None:
@@ -268,8 +273,11 @@ def solve(
         terminal.say(f"warning: {warning}")
     if solved.judgement is not None:
         terminal.say(f"against the known truth: the pattern is {100 * solved.judgement.source_error:.2g} % off")
+    if solved.shortfall:
+        terminal.say(f"FAILED: {solved.shortfall}")
     terminal.say(f"open {out / 'report.html'}")
     terminal.document(solved.summary())
+    raise typer.Exit(1 if solved.shortfall else 0)
 
 
 @app.command(epilog="Example: wallmirror figures 3.2 3.3 -o out/figures")
