@@ -15,7 +15,7 @@ from wallmirror.brdf import AngleSumBRDF
 from wallmirror.derendering.foresight import foresee
 from wallmirror.errors import InputError
 from wallmirror.jobs.bouncing import RR_DEPTH
-from wallmirror.jobs.piloting import NoisePilot, Truncation, pilot_gain, pilot_noise, truncations
+from wallmirror.jobs.piloting import LeftOut, NoisePilot, Truncation, left_out, pilot_gain, pilot_noise
 from wallmirror.pathtracing.building import wall_as_rendered
 from wallmirror.pathtracing.rendering import Renderer
 from wallmirror.planning.forward import cheapest_quadrature, coarsest_knots, fewest_table_nodes
@@ -25,6 +25,7 @@ from wallmirror.planning.plan import (
     CapturePlan,
     ForwardPlan,
     Plan,
+    Route,
     SolvePlan,
     Term,
     ValidatePlan,
@@ -45,7 +46,6 @@ _DEPTH_SHARE = 0.5
 _TABLE_SHARE = 0.2
 # Deeper paths are ended by chance where the scene would not.
 _DEEP_FROM = 8
-_DEPTH_PIXELS = 128
 _KNOTS_SHARE = 0.3
 _FORESIGHT_SIZE = 20_000  # rows x elements that the bound of a pilot may have
 _VALIDATE_AIM = 0.75
@@ -96,10 +96,10 @@ def advise(
     if set(parts) != {"validate"}:
         tell("the analytic model against its simplifications")
         drawn = sketch(scene, tolerance=tolerance)
-        found: tuple[Truncation, ...] = ()
+        found = LeftOut((Truncation(2, 0.0 if scene.is_one_bounce else math.nan, 0.0),))
         if filmed:
             tell("light of many bounces and noise, by small renders")
-            found = truncations(scene, _small(scene), seed=seed)
+            found = left_out(scene, seed=seed)
             capture, noise = _capture(scene, drawn, found, tolerance, seed)
             if "solve" in parts:
                 tell("what noise does to the recovered pattern")
@@ -123,13 +123,12 @@ def advise(
     )
 
 
-def _one_bounce(scene: Scene, found: tuple[Truncation, ...]) -> Hypothesis:
+def _one_bounce(scene: Scene, found: LeftOut) -> Hypothesis:
     """Hypothesis 2 with what one bounce leaves out here."""
+    error = found.depths[0].error
     if scene.is_one_bounce:
-        return one_bounce_hypothesis(0.0, "nothing but the wall reflects")
-    if not found:
-        return one_bounce_hypothesis(math.nan, "points cannot be rendered")
-    return one_bounce_hypothesis(found[0].error, "rendered with common random numbers")
+        return one_bounce_hypothesis(error, "nothing but the wall reflects")
+    return one_bounce_hypothesis(error, "points cannot be rendered" if math.isnan(error) else "rendered")
 
 
 def plan_capture(scene: Scene, tolerance: float, *, seed: int = 0) -> CapturePlan:
@@ -157,32 +156,31 @@ def filmable(scene: Scene) -> bool:
     return not scene.card.is_points and scene.observer.pixels_at == "centres"
 
 
-def _small(scene: Scene) -> Renderer:
-    pixels = min(_DEPTH_PIXELS, scene.observer.pixels)
-    return Renderer(replace(scene, observer=replace(scene.observer, pixels=pixels)))
-
-
-def _forward(
-    scene: Scene, drawn: Sketch, found: tuple[Truncation, ...], capture: CapturePlan | None, tolerance: float
-) -> ForwardPlan:
-    left_out = found[0] if found else Truncation(2, 0.0, 0.0)
-    enough = left_out.upper < _DEPTH_SHARE * tolerance
-    quadrature = cheapest_quadrature(
-        drawn, tolerance=AIM * tolerance - (left_out.upper if enough else 0.0), views=scene.observer.views
-    )
+def _forward(scene: Scene, drawn: Sketch, found: LeftOut, capture: CapturePlan | None, tolerance: float) -> ForwardPlan:
+    """One bounce where it is enough, else with the card's glow, else the path tracer."""
+    one, glow = found.depths[0], found.with_glow
+    route: Route = "analytic"
+    rest, seconds = one, 0.0
+    if one.upper > _DEPTH_SHARE * tolerance:
+        if glow is not None and glow.upper <= _DEPTH_SHARE * tolerance:
+            route, rest, seconds = "analytic with glow", glow, found.glow_seconds
+        elif capture is not None:
+            route, rest = "path tracing", replace(one, upper=0.0)
+    left = AIM * tolerance - min(rest.upper, _DEPTH_SHARE * tolerance)
+    quadrature = cheapest_quadrature(drawn, tolerance=left, views=scene.observer.views)
+    if route == "path tracing" and capture is not None:
+        return ForwardPlan(route=route, quadrature=quadrature, terms=capture.terms, seconds=capture.seconds)
     terms = (
-        Term(name="bounces left out", error=left_out.error, kind="bias"),
+        Term(name="bounces left out", error=rest.error, kind="bias"),
         Term(name="quadrature", error=quadrature.error, kind="bias"),
     )
-    if enough or capture is None:
-        return ForwardPlan(route="analytic", quadrature=quadrature, terms=terms, seconds=quadrature.seconds)
-    return ForwardPlan(route="path tracing", quadrature=quadrature, terms=capture.terms, seconds=capture.seconds)
+    return ForwardPlan(route=route, quadrature=quadrature, terms=terms, seconds=quadrature.seconds + seconds)
 
 
 def _capture(
-    scene: Scene, drawn: Sketch, found: tuple[Truncation, ...], tolerance: float, seed: int
+    scene: Scene, drawn: Sketch, found: LeftOut, tolerance: float, seed: int
 ) -> tuple[CapturePlan, NoisePilot]:
-    depth = next(t for t in found if t.upper <= _DEPTH_SHARE * tolerance)
+    depth = next(t for t in found.depths if t.upper <= _DEPTH_SHARE * tolerance)
     rr_depth = scene.render.rr_depth if depth.depth < _DEEP_FROM else min(RR_DEPTH, scene.render.rr_depth)
     nodes, table = _table(scene, drawn, tolerance)
     noise = pilot_noise(scene, Renderer(scene), max_depth=depth.depth, rr_depth=rr_depth, seed=seed)
@@ -296,15 +294,21 @@ def _solution(
     )
 
 
+_ROUTES: dict[Route, str] = {
+    "analytic": "analytic, one bounce",
+    "analytic with glow": "analytic, one bounce and the card's glow",
+}
+
+
 def plan_rows(plan: Plan) -> list[list[str]]:
     """What to do, with which settings, to which predicted error and in which predicted time: a row for each task."""
     forward, capture, validation, solution = plan.forward, plan.capture, plan.validate, plan.solve
     rows = []
-    if forward is not None and forward.route == "analytic":
+    if forward is not None and forward.route != "path tracing":
         rows.append(
             [
                 "predict the wall",
-                f"analytic, one bounce; {_nodes(forward)}",
+                f"{_ROUTES[forward.route]}; {_nodes(forward)}",
                 percent(forward.error),
                 _time(forward.seconds),
             ]

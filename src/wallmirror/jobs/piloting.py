@@ -10,7 +10,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from wallmirror.brdf import AngleSumBRDF
 from wallmirror.comparison import detectable_gain
+from wallmirror.interreflection import from_card
 from wallmirror.jobs.bouncing import DEEP, RR_DEPTH, spread
 from wallmirror.jobs.validating import SEEDS, expect, render_seeds
 from wallmirror.pathtracing.rendering import Renderer, largest_pass, spread_seeds
@@ -29,8 +31,8 @@ _STRATIFIED_SEEDS = 4
 _DEPTH_PIXELS = 128
 _DEPTH_SPP = 256
 _DEPTH_SEEDS = 4
-_OPEN_DEPTHS = (2, 4, 6, 8, 12)  # in the open only odd numbers of bounces reach the camera
-_ROOM_DEPTHS = (2, 3, 4, 6, 8, 12)
+_OPEN_DEPTHS = (2, 4, 6, 10)  # in the open only odd numbers of bounces reach the camera
+_ROOM_DEPTHS = (2, 3, 4, 6, 10)
 _GAIN_SPP = (36, 144)
 _GAIN_SEEDS = 8
 _GAIN_VIEWS = 3
@@ -45,35 +47,62 @@ class Truncation:
     upper: float
 
 
-def truncations(scene: Scene, renderer: Renderer, *, seed: int) -> tuple[Truncation, ...]:
-    """The error of each depth up to DEEP, which stands for all bounces, from differences with common random numbers.
+@dataclass(frozen=True)
+class LeftOut:
+    """What paths of each depth leave out, shallowest first, and what is left with the card's computed glow added.
 
     Parameters
     ----------
-    renderer:
-        Of the scene with at most 128 pixels, whose films are wider but not darker.
+    depths:
+        From one bounce to DEEP, which stands for all and leaves out nothing.
+    with_glow:
+        One bounce and `from_card`; None where the card is black, in a room, or before a mirror.
+    glow_seconds:
+        What computing the glow takes for all films of the scene.
     """
+
+    depths: tuple[Truncation, ...]
+    with_glow: Truncation | None = None
+    glow_seconds: float = 0.0
+
+
+def left_out(scene: Scene, *, seed: int) -> LeftOut:
+    """Measure each depth's error by differences with common random numbers, on at most 128 pixels."""
     if scene.is_one_bounce:
-        return (Truncation(2, 0.0, 0.0),)
+        return LeftOut((Truncation(2, 0.0, 0.0),))
+    pixels = min(_DEPTH_PIXELS, scene.observer.pixels)
+    views, patterns = spread(scene.observer.views, 2), spread(scene.source.shape[1], 2)
+    angles = tuple(scene.observer.view_angles[v] for v in views)
+    few = replace(scene, observer=replace(scene.observer, pixels=pixels, view_angles=angles))
+    renderer = Renderer(few)
     depths = (*(_OPEN_DEPTHS if scene.room is None else _ROOM_DEPTHS), DEEP)
-    films = [(v, b) for v in spread(scene.observer.views, 2) for b in spread(scene.source.shape[1], 2)]
-    roots = spread_seeds(seed, len(films) * _DEPTH_SEEDS)
-    light = np.empty((len(depths), _DEPTH_SEEDS, len(films), renderer.scene.observer.pixels))
-    for f, (view, pattern) in enumerate(films):
-        seeds = roots[f * _DEPTH_SEEDS : (f + 1) * _DEPTH_SEEDS]
-        for d, depth in enumerate(depths):
-            render = renderer.render(
-                view,
-                scene.source[:, pattern],
-                spp=_DEPTH_SPP,
-                seeds=seeds,
-                max_depth=depth,
-                rr_depth=RR_DEPTH,
-                sampler="multijitter",
-                method="seeds",
-            )
-            light[d, :, f] = render.per_seed
-    return truncations_of(depths, light.reshape(len(depths), _DEPTH_SEEDS, -1))
+    roots = spread_seeds(seed, len(views) * len(patterns) * _DEPTH_SEEDS)
+    light = np.empty((len(depths), _DEPTH_SEEDS, len(views), pixels, len(patterns)))
+    for view in range(len(views)):
+        for b, pattern in enumerate(patterns):
+            first = (view * len(patterns) + b) * _DEPTH_SEEDS
+            for d, depth in enumerate(depths):
+                render = renderer.render(
+                    view,
+                    scene.source[:, pattern],
+                    spp=_DEPTH_SPP,
+                    seeds=roots[first : first + _DEPTH_SEEDS],
+                    max_depth=depth,
+                    rr_depth=RR_DEPTH,
+                    sampler="multijitter",
+                )
+                light[d, :, view, :, b] = render.per_seed
+    flat = light.reshape(len(depths), _DEPTH_SEEDS, -1)
+    found = truncations_of(depths, flat)
+    brdf = scene.wall.brdf
+    if scene.room is not None or not isinstance(brdf, AngleSumBRDF):
+        return LeftOut(found)
+    started = time.perf_counter()
+    glow = from_card(few.observer, scene.card, brdf, scene.source[:, list(patterns)])
+    seconds = (time.perf_counter() - started) * scene.observer.views * scene.observer.pixels / (len(views) * pixels)
+    rest = truncations_of((2, DEEP), np.stack([flat[0] + glow.ravel(), flat[-1]]))[0]
+    # Where the pilot's own noise is all that is seen, the error may be anything up to its limit.
+    return LeftOut(found, replace(rest, error=max(rest.error, rest.upper / 2)), seconds)
 
 
 def truncations_of(depths: Sequence[int], light: Array) -> tuple[Truncation, ...]:

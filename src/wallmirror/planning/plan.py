@@ -18,6 +18,8 @@ SMALLEST, LARGEST = 1e-5, 0.5
 AIM = 0.8
 
 Kind = Literal["bias", "noise"]
+#: How the wall's radiance may be predicted.
+Route = Literal["analytic", "analytic with glow", "path tracing"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,12 +52,13 @@ def total_error(terms: tuple[Term, ...]) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class ForwardPlan:
-    """How to predict the wall's radiance: the analytic one-bounce model, where that is enough, else the path tracer.
+    """How to predict the wall's radiance: the analytic model, where that is enough, else the path tracer.
 
     Parameters
     ----------
     route:
-        "analytic" or "path tracing"; the latter's settings are those of the capture.
+        "analytic" (one bounce), "analytic with glow" (and `interreflection.from_card`), or "path tracing" with the
+        settings of the capture.
     quadrature:
         Of the analytic model, the cheapest that keeps what the missing bounces leave of the tolerance.
     terms:
@@ -64,7 +67,7 @@ class ForwardPlan:
         Predicted for all films.
     """
 
-    route: Literal["analytic", "path tracing"]
+    route: Route
     quadrature: Quadrature
     terms: tuple[Term, ...]
     seconds: float
