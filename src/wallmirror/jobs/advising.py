@@ -194,6 +194,7 @@ def _capture(
     )
     films = scene.observer.views * scene.source.shape[1]
     plan = CapturePlan(
+        tolerance=tolerance,
         sampling=sampling,
         max_depth=depth.depth,
         rr_depth=rr_depth,

@@ -69,9 +69,10 @@ def film_as_planned(
 ) -> CaptureSet:
     """Render a capture set with a plan's settings, as far as no explicit one beats them."""
     sampling, brdf = plan.sampling, scene.wall.brdf
+    whole = spp is None and max_depth is None
     if plan.table_nodes is not None and isinstance(brdf, AngleSumBRDF):
         scene = replace(scene, wall=replace(scene.wall, brdf=tabulate(brdf, plan.table_nodes)))
-    return render_captures(
+    captures = render_captures(
         scene,
         spp=sampling.spp if spp is None else spp,
         seeds=sampling.seeds if spp is None else 1,
@@ -82,6 +83,11 @@ def film_as_planned(
         variant=variant,
         progress=progress,
     )
+    if not whole:
+        return captures
+    # What was promised goes with the films, as far as they are what was planned.
+    promise = {"tolerance": f"{plan.tolerance:g}", "predicted_error": f"{plan.error:.3g}"}
+    return replace(captures, provenance={**captures.provenance, **promise})
 
 
 def truth_of(scene: Scene) -> Truth:

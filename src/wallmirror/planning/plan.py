@@ -84,6 +84,8 @@ class CapturePlan:
 
     Parameters
     ----------
+    tolerance:
+        That was asked for.
     sampling:
         Sampler, samples per pixel of a seed, and seeds.
     max_depth, rr_depth:
@@ -96,6 +98,7 @@ class CapturePlan:
         The predicted error by its parts.
     """
 
+    tolerance: float
     sampling: Sampling
     max_depth: int
     rr_depth: int

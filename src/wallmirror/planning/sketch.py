@@ -108,10 +108,11 @@ def sketch(scene: Scene, *, tolerance: float) -> Sketch:
         Where a single view is too large to be measured in seconds, or one bounce brings no light.
     """
     observer, card, brdf = scene.observer, scene.card, scene.wall.brdf
+    some = _some_views(observer, card, (1, 1))
     if isinstance(brdf, Mirror):
-        films = _lit(radiance(mirror_matrix(observer, card, brdf), scene.source))
-        return Sketch(observer, card, brdf, scene.source, (0, 0), None, films, 0.0)
-    orders = quadrature_orders(observer, card, resolution=brdf.angular_scale, tolerance=min(1e-4, 1e-2 * tolerance))
+        films = _lit(radiance(mirror_matrix(some, card, brdf), scene.source))
+        return Sketch(some, card, brdf, scene.source, (0, 0), None, films, 0.0)
+    orders = quadrature_orders(some, card, resolution=brdf.angular_scale, tolerance=min(1e-4, 1e-2 * tolerance))
     while True:
         some = _some_views(observer, card, orders)
         kernel = build_kernel(some, card, orders=orders)
