@@ -157,7 +157,7 @@ def advise(
 ) -> None:
     """Measure what a scene needs to reach an accuracy: which simplifications hold, and the cheapest settings."""
     from wallmirror.jobs.advising import advise as plan_for
-    from wallmirror.jobs.advising import hypothesis_rows, percent, plan_rows
+    from wallmirror.planning.words import hypothesis_rows, percent, plan_rows
     from wallmirror.scene import load_scene
 
     terminal = Terminal(as_json=as_json)
@@ -197,7 +197,8 @@ def capture(
     loaded = load_scene(scene)
     plan = None
     if tolerance is not None:
-        from wallmirror.jobs.advising import capture_line, plan_capture
+        from wallmirror.jobs.advising import plan_capture
+        from wallmirror.planning.words import capture_line
 
         plan = plan_capture(loaded, tolerance, seed=seed)
         terminal.note(f"planned: {capture_line(plan)}")

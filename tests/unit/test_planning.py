@@ -10,7 +10,7 @@ from tests.unit.helpers import lobes, refused
 
 from wallmirror import Card, Diffuse, Mirror, Scene, Table, Wall, load_scene, radiance, transport_matrix
 from wallmirror.comparison import compare, cross_weights, detectable_gain
-from wallmirror.jobs.advising import hypothesis_rows, percent, plan_rows
+from wallmirror.jobs.advising import advise, plan_capture
 from wallmirror.jobs.piloting import truncations_of
 from wallmirror.planning.forward import Quadrature, cheapest_quadrature, coarsest_knots, fewest_table_nodes
 from wallmirror.planning.hypotheses import one_bounce_hypothesis, simplifications, table_error
@@ -26,6 +26,7 @@ from wallmirror.planning.plan import (
 )
 from wallmirror.planning.sampling import LEAST_SEEDS, MOST_SPP, NoiseLevel, Sampling, cheapest_sampling
 from wallmirror.planning.sketch import relative_error, sketch
+from wallmirror.planning.words import hypothesis_rows, percent, plan_rows
 from wallmirror.transport import build_kernel
 
 
@@ -386,9 +387,27 @@ def test_what_people_read_is_short_and_says_what_to_do():
     rows = {row[0]: row for row in plan_rows(a_plan())}
     assert rows["predict the wall"][1:3] == ["analytic, one bounce; 3 nodes a strip, 2 nodes a pixel", "0.1 %"]
     assert rows["capture"][1:] == ["depth 2, 8 seeds x 256 multijitter samples a pixel", "0.6 %", "16 s"]
-    assert rows["solve"][2] == "unbounded"
+    assert rows["solve"][1:3] == ["not with those films: 64 samples a pixel; pattern off by noise", "unbounded"]
+    limit = replace(a_plan().forward, terms=(Term(name="glow", error=1e-3, kind="bias", limit=True),))
+    assert plan_rows(a_plan(forward=limit))[0][2] == "< 0.1 %"
     assert hypothesis_rows(a_plan())[0][2:] == ["-", "unknown"]
     assert [percent(e) for e in (1e-5, 0.0123, 0.5, 1.2, 83.0)] == ["0.001 %", "1.2 %", "50 %", "120 %", "83 times"]
+
+
+def test_points_are_planned_for_without_a_renderer():
+    scene = small(element_width=0.0, element_height=0.0)
+    plan = advise(scene, 1e-2)
+    assert (plan.capture, plan.validate, plan.solve) == (None, None, None)
+    assert plan.forward.route == "analytic"
+    assert plan.reached
+    assert "points" in plan.notes[0]
+    assert "points" in str(refused(lambda: plan_capture(scene, 1e-2)))
+    # A white card before points: what one bounce leaves out cannot be rendered, and is not said to be nothing.
+    white = replace(scene, card=replace(scene.card, albedo=0.8, board_width=5.1, board_height=2.0))
+    unknown = advise(white, 1e-2)
+    assert not unknown.reached
+    assert math.isnan(unknown.hypothesis("one bounce").error)
+    json.dumps(unknown.summary(), allow_nan=False)
 
 
 def test_a_mirror_needs_no_nodes():

@@ -30,11 +30,14 @@ class Term:
     ----------
     kind:
         "bias" parts may all point the same way and add; "noise" adds to them in the mean square.
+    limit:
+        Whether the error is but a limit, below which the pilot's own noise hid the truth.
     """
 
     name: str
     error: float
     kind: Kind
+    limit: bool = False
 
 
 def total_error(terms: tuple[Term, ...]) -> float:
@@ -76,6 +79,11 @@ class ForwardPlan:
     def error(self) -> float:
         """Predicted relative L2 error of the films."""
         return total_error(self.terms)
+
+    @property
+    def is_limit(self) -> bool:
+        """Whether the error is but an upper limit (see `Term`)."""
+        return any(term.limit for term in self.terms)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,11 +246,13 @@ def checked_tolerance(tolerance: float) -> float:
 
 
 def _budget(terms: tuple[Term, ...], seconds: float) -> dict[str, Any]:
-    return {
-        "error": total_error(terms),
-        "terms": [dict(vars(term)) for term in terms],
-        "seconds": seconds,
-    }
+    parts = [{**vars(term), "error": _known(term.error)} for term in terms]
+    return {"error": _known(total_error(terms)), "terms": parts, "seconds": seconds}
+
+
+def _known(value: float) -> float | None:
+    """A number for JSON; None where it is not finite."""
+    return value if math.isfinite(value) else None
 
 
 def _forward(plan: ForwardPlan) -> dict[str, Any]:
@@ -263,6 +273,6 @@ def _capture(plan: CapturePlan) -> dict[str, Any]:
 
 def _solve(plan: SolvePlan) -> dict[str, Any]:
     document = dict(vars(plan))
-    document["source_error"] = plan.source_error if math.isfinite(plan.source_error) else None
+    document["source_error"] = _known(plan.source_error)
     document["patterns"] = {"independent": plan.patterns[0], "needed": plan.patterns[1]}
     return document
