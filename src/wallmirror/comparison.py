@@ -304,7 +304,7 @@ def detectable_gain(
         return math.inf
     shares = weights * reference * (seeds - reference) / power[:, None, None]
     error = math.sqrt(float(np.mean(np.sum(shares**2, axis=(1, 2)))) / planned)
-    return max(1e-5 if error < 1e-6 else 0.0, _units(SIGNIFICANCE / (templates + 3), planned) * error)
+    return max(1e-5 if error < 1e-6 else 0.0, _units(SIGNIFICANCE / (templates + 3), planned) * error + _FLOAT32)
 
 
 def _beyond(values: Array, slack: Array) -> Array:

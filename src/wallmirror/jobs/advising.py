@@ -11,15 +11,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from wallmirror.brdf import AngleSumBRDF
+from wallmirror.brdf import AngleSumBRDF, Mirror
 from wallmirror.derendering.foresight import foresee
 from wallmirror.errors import InputError
-from wallmirror.jobs.bouncing import RR_DEPTH
+from wallmirror.jobs.bouncing import RR_DEPTH, spread
 from wallmirror.jobs.piloting import LeftOut, NoisePilot, Truncation, left_out, pilot_gain, pilot_noise
 from wallmirror.pathtracing.building import wall_as_rendered
 from wallmirror.pathtracing.rendering import Renderer
 from wallmirror.planning.forward import cheapest_quadrature, coarsest_knots, fewest_table_nodes
-from wallmirror.planning.hypotheses import Hypothesis, one_bounce_hypothesis, simplifications, table_error
+from wallmirror.planning.hypotheses import Hypothesis, one_bounce_hypothesis, simplifications, stand_in_error
 from wallmirror.planning.plan import (
     AIM,
     CapturePlan,
@@ -213,12 +213,11 @@ def _capture(
 
 def _table(scene: Scene, drawn: Sketch, tolerance: float) -> tuple[int | None, float]:
     """Nodes of the BRDF's table, None where the renderer's own are enough, and the error that they make."""
-    rendered = wall_as_rendered(scene)
-    nodes = np.size(getattr(rendered, "values", ()))
-    if nodes == 0 or rendered is scene.wall.brdf or not isinstance(scene.wall.brdf, AngleSumBRDF):
+    brdf = scene.wall.brdf
+    if isinstance(brdf, Mirror):
         return None, 0.0
-    error = table_error(drawn, nodes)
-    if error <= _TABLE_SHARE * tolerance:
+    error = stand_in_error(drawn, wall_as_rendered(scene))
+    if error <= _TABLE_SHARE * tolerance or not isinstance(brdf, AngleSumBRDF):
         return None, error
     finer = fewest_table_nodes(drawn, tolerance=_TABLE_SHARE * tolerance)
     return (None, error) if finer is None else finer
@@ -267,24 +266,21 @@ def _solution(
             f"{rank} independent patterns cannot determine {card.elements} elements; give the scene at least as many"
         )
         return None
+    knots = coarsest_knots(drawn, tolerance=_KNOTS_SHARE * tolerance)
+    assert knots is not None
     fewer = max(1, _FORESIGHT_SIZE // (observer.pixels * card.elements))
-    keep = np.unique(np.linspace(0, len(noise.views) - 1, min(fewer, len(noise.views))).round().astype(int))
-    views = [noise.views[k] for k in keep]
-    std = noise.std[keep]
-    # What no sample found has a noise all the same.
-    std = np.maximum(std, 1e-2 * float(std.max()))
-    # The pilot's noise has the shape, the plan's sampling the size.
-    size = capture.sampling.noise / noise.relative()
+    views, std = noise.film_std(capture.sampling)
+    keep = spread(len(views), min(fewer, len(views)))
+    std = std[list(keep)]
     forecast = foresee(
-        replace(observer, view_angles=tuple(observer.view_angles[v] for v in views)),
+        replace(observer, view_angles=tuple(observer.view_angles[views[k]] for k in keep)),
         card,
         brdf,
         scene.source[:, list(noise.patterns)],
-        noise=size * std,
+        noise=np.maximum(std, 1e-2 * float(std.max())),  # as the solver's weights, and more than what rounds to nothing
+        step_deg=knots[0],
     )
-    error = forecast.source_error * math.sqrt(len(views) / observer.views)
-    knots = coarsest_knots(drawn, tolerance=_KNOTS_SHARE * tolerance)
-    assert knots is not None
+    error = forecast.source_error * math.sqrt(len(keep) / observer.views)
     needed = capture.sampling.total * (error / (AIM * tolerance)) ** 2
     if not scene.is_one_bounce:
         notes.append(

@@ -15,8 +15,9 @@ from wallmirror.comparison import detectable_gain
 from wallmirror.interreflection import from_card
 from wallmirror.jobs.bouncing import DEEP, RR_DEPTH, spread
 from wallmirror.jobs.validating import SEEDS, expect, render_seeds
+from wallmirror.pathtracing.filming import steadied
 from wallmirror.pathtracing.rendering import Renderer, largest_pass, spread_seeds
-from wallmirror.planning.sampling import MOST_SPP, NoiseLevel, Sampler
+from wallmirror.planning.sampling import MOST_SPP, NoiseLevel, Sampler, Sampling
 from wallmirror.scene import Scene
 
 Array = NDArray[np.float64]
@@ -147,16 +148,29 @@ class NoisePilot:
         The films behind `std`.
     std:
         Standard deviation of the radiance for one independent sample per pixel, shape (A', N, B').
+    stratified_views:
+        Positions in `views` of those that were rendered with stratified samples as well, A'' of them.
+    ratios:
+        For each stratified level, standard deviation of one seed over that of one independent sample, (A'', N).
     """
 
     levels: tuple[NoiseLevel, ...]
     views: tuple[int, ...]
     patterns: tuple[int, ...]
     std: Array = field(repr=False)
+    stratified_views: tuple[int, ...]
+    ratios: dict[int, Array] = field(repr=False)
 
-    def relative(self) -> float:
-        """Rms noise of one independent sample over the rms radiance."""
-        return next(level.noise * math.sqrt(level.spp) for level in self.levels if level.sampler == "independent")
+    def film_std(self, sampling: Sampling) -> tuple[tuple[int, ...], Array]:
+        """Standard deviation of the radiance in some views with a sampling: the views, and (A', N, B').
+
+        Stratified samples make pixels quiet where the light is smooth, which the recovered pattern profits from.
+        """
+        if sampling.sampler == "independent":
+            return self.views, self.std / math.sqrt(sampling.total)
+        some = list(self.stratified_views)
+        quiet = self.ratios[sampling.spp][:, :, None] * self.std[some]
+        return tuple(self.views[k] for k in some), quiet / math.sqrt(sampling.seeds)
 
 
 @dataclass(frozen=True)
@@ -208,16 +222,24 @@ def pilot_noise(scene: Scene, renderer: Renderer, *, max_depth: int, rr_depth: i
     levels = [level]
     if most > spp:
         levels.append(replace(level, spp=most, noise=level.noise * math.sqrt(spp / most), seconds=longer))
-    chosen = [(v, patterns[k % len(patterns)]) for k, v in enumerate(spread(scene.observer.views, _STRATIFIED_FILMS))]
-    camera.film(*chosen[0], "multijitter", _STRATIFIED_SPP[0], 2)
+    std = np.sqrt(spp * np.array([[film.variance for film in line] for line in made]).transpose(0, 2, 1))
+    positions = spread(len(views), _STRATIFIED_FILMS)
+    chosen = [(k, n % len(patterns)) for n, k in enumerate(positions)]
+    camera.film(views[0], patterns[0], "multijitter", _STRATIFIED_SPP[0], 2)
+    ratios = {}
     for stratified in _STRATIFIED_SPP:
         seeds = min(_STRATIFIED_SEEDS, _SAMPLES // (len(chosen) * stratified * pixels))
         if stratified > most or seeds < 2:
             break
-        several = [camera.film(view, pattern, "multijitter", stratified, seeds) for view, pattern in chosen]
+        several = [camera.film(views[a], patterns[b], "multijitter", stratified, seeds) for a, b in chosen]
         levels.append(_level("multijitter", stratified, several))
-    std = np.sqrt(spp * np.array([[film.variance for film in line] for line in made]))
-    return NoisePilot(tuple(levels), views, patterns, std.transpose(0, 2, 1))
+        ratios[stratified] = np.array(
+            [
+                np.sqrt(steadied(film.variance, seeds)) / np.maximum(std[a, :, b], 1e-3 * std[a, :, b].max())
+                for film, (a, b) in zip(several, chosen, strict=True)
+            ]
+        )
+    return NoisePilot(tuple(levels), views, patterns, std, positions, ratios)
 
 
 def _level(sampler: Sampler, spp: int, films: Sequence[_Film]) -> NoiseLevel:

@@ -72,7 +72,7 @@ def render_captures(
         )
         radiance[view, :, realisation] = render.mean
         known = render.method == "moments"
-        variance[view, :, realisation] = render.variance if known else _steadied(render.variance, seeds)
+        variance[view, :, realisation] = render.variance if known else steadied(render.variance, seeds)
         if progress is not None:
             progress(done + 1, views * realisations)
     runtime = renderer.runtime
@@ -95,7 +95,7 @@ def render_captures(
     )
 
 
-def _steadied(variance: Array, seeds: int) -> Array:
+def steadied(variance: Array, seeds: int) -> Array:
     """The seeds' variance, shape (N,), drawn towards the mean of the neighbours: a few seeds know it but roughly."""
     wide = np.pad(variance, _NEIGHBOURS // 2, mode="edge")
     around = np.lib.stride_tricks.sliding_window_view(wide, _NEIGHBOURS).mean(axis=-1)

@@ -285,5 +285,9 @@ def table_error(sketch: Sketch, nodes: int) -> float:
         return 0.0
     # Float64 as it is: rounding to float32 makes 3e-8, which no film would show.
     u = np.linspace(-math.pi, math.pi, nodes)
-    table = AngleSumTable(start=-math.pi, stop=math.pi, values=sketch.brdf.of_sum(u))
-    return sketch.error(sketch.kernel.apply(table))
+    return stand_in_error(sketch, AngleSumTable(start=-math.pi, stop=math.pi, values=sketch.brdf.of_sum(u)))
+
+
+def stand_in_error(sketch: Sketch, brdf: BRDF) -> float:
+    """Relative L2 error of the films with another BRDF in the place of the scene's."""
+    return 0.0 if sketch.kernel is None else sketch.error(sketch.kernel.apply(brdf))
