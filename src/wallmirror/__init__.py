@@ -36,6 +36,7 @@ from wallmirror.derendering.solution import Solution
 from wallmirror.derendering.solve import solve
 from wallmirror.errors import InputError, MissingRuntimeError, UndeterminedError, WallmirrorError
 from wallmirror.geometry import Card, Observer, scan_angles, wall_points
+from wallmirror.planning import Hypothesis, Plan
 from wallmirror.scene import RenderSettings, Room, Scene, Wall, load_scene, scene_names
 from wallmirror.transport import (
     Kernel,
@@ -65,6 +66,7 @@ __all__ = [
     "Fresnel",
     "GaussianTrain",
     "GeneralSum",
+    "Hypothesis",
     "InputError",
     "Kernel",
     "Mirror",
@@ -72,6 +74,7 @@ __all__ = [
     "Observer",
     "Phong",
     "PhongIllumination",
+    "Plan",
     "RenderSettings",
     "Room",
     "Scene",

@@ -92,7 +92,8 @@ def validate(
     tolerance: Annotated[
         float | None,
         typer.Option(
-            help="With --bounces: share of the light that one bounce may leave out, e.g. 0.01; else only told."
+            help="Gain error that must show, e.g. 0.001: views and samples follow. With --bounces: share of the light "
+            "that one bounce may leave out."
         ),
     ] = None,
     seed: Seed = 0,
@@ -100,11 +101,11 @@ def validate(
 ) -> None:
     """Test the analytic one-bounce model against Mitsuba, scene by scene, and say what bias would have shown."""
     from wallmirror.jobs.validating import QUICK_SPP, QUICK_VIEWS, SPP, VIEWS, validate_scenes, verdict
-    from wallmirror.scene import load_scene, scene_names
+    from wallmirror.scene import Scene, load_scene, scene_names
 
     terminal = Terminal(as_json=as_json)
-    if tolerance is not None and not (bounces and 0 < tolerance < 1):
-        raise InputError("give a share between 0 and 1, together with --bounces", field="--tolerance")
+    if tolerance is not None and not 0 < tolerance < 1:
+        raise InputError(f"is {tolerance:g}; give a share between 0 and 1", field="--tolerance")
     if bounces:
         from wallmirror.jobs.counting_bounces import count_bounces
 
@@ -120,11 +121,23 @@ def validate(
         terminal.say(f"{verdict_word}open {out / 'bounces.html'}")
         terminal.document({"passed": enough, "scenes": [r.summary() for r in counted]})
         raise typer.Exit(0 if enough else 1)
-    views = views or (QUICK_VIEWS if quick else VIEWS)
-    spp = spp or (QUICK_SPP if quick else SPP)
     loaded = [load_scene(name) for name in (scenes or scene_names())]
+
+    def effort(scene: Scene) -> tuple[int, int]:
+        if tolerance is None:
+            return (QUICK_VIEWS, QUICK_SPP) if quick else (VIEWS, SPP)
+        from wallmirror.jobs.advising import advise as plan_for
+
+        plan = plan_for(scene, tolerance, parts=("validate",), seed=seed).validate
+        if plan is None:
+            raise InputError("has points for strips or pixels, which paths never meet", field=scene.name)
+        terminal.note(f"{scene.name}: planned {plan.views} views, 32 seeds of {plan.spp} samples")
+        return plan.views, plan.spp
+
     with terminal.progress("validating") as advance:
-        results = validate_scenes(loaded, out, views=views, spp=spp, seed=seed, progress=advance)
+        results = validate_scenes(
+            loaded, out, views=views, spp=spp, tolerance=tolerance, effort=effort, seed=seed, progress=advance
+        )
     for result in results:
         terminal.say(("ok    " if result.passed else "FAIL  ") + verdict(result).text)
     passed = all(r.passed for r in results)
@@ -133,12 +146,46 @@ def validate(
     raise typer.Exit(0 if passed else 1)
 
 
+@app.command(epilog="Example: wallmirror advise flat_wall_lobes --tolerance 0.01")
+def advise(
+    scene: Annotated[str, typer.Argument(help="A scene's name, or a .toml file.")],
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", help="Error wanted: rms over all films in units of their rms radiance.")
+    ] = 0.01,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Measure what a scene needs to reach an accuracy: which simplifications hold, and the cheapest settings."""
+    from wallmirror.jobs.advising import advise as plan_for
+    from wallmirror.planning.words import hypothesis_rows, percent, plan_rows
+    from wallmirror.scene import load_scene
+
+    terminal = Terminal(as_json=as_json)
+    plan = plan_for(load_scene(scene), tolerance, seed=seed, progress=terminal.note)
+    terminal.say(f"{plan.scene}: the cheapest ways to an error of {percent(tolerance)}")
+    terminal.say()
+    terminal.table(["to", "do", "error", "time here"], plan_rows(plan), words=2)
+    terminal.say()
+    terminal.table(["", "simplification", "", "error alone"], hypothesis_rows(plan), words=3)
+    terminal.say("* after the best global scale, as the formula has none of its own")
+    for note in plan.notes:
+        terminal.say(f"note: {note}")
+    terminal.document(plan.summary())
+    raise typer.Exit(0 if plan.reached else 1)
+
+
 @app.command(epilog="Example: wallmirror capture cornell_lobes -o out/box --max-depth 50")
 def capture(
     scene: Annotated[str, typer.Argument(help="A scene's name, or a .toml file.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the capture set.")],
-    spp: Annotated[int | None, typer.Option(min=1, help="Samples per pixel; the scene's own if left out.")] = None,
+    spp: Annotated[
+        int | None, typer.Option(min=1, help="Samples per pixel; the plan's or the scene's own if left out.")
+    ] = None,
     max_depth: Annotated[int | None, typer.Option(min=2, help="2 is one bounce; the scene's own if left out.")] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(help="Error wanted, as for `advise`, which then chooses samples, seeds and depth."),
+    ] = None,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -148,8 +195,15 @@ def capture(
 
     terminal = Terminal(as_json=as_json)
     loaded = load_scene(scene)
+    plan = None
+    if tolerance is not None:
+        from wallmirror.jobs.advising import plan_capture
+        from wallmirror.planning.words import capture_line
+
+        plan = plan_capture(loaded, tolerance, seed=seed)
+        terminal.note(f"planned: {capture_line(plan)}")
     with terminal.progress(f"filming {loaded.name}") as advance:
-        captures = capture_scene(loaded, out, spp=spp, seed=seed, max_depth=max_depth, progress=advance)
+        captures = capture_scene(loaded, out, spp=spp, seed=seed, max_depth=max_depth, plan=plan, progress=advance)
     views, pixels, realisations = captures.radiance.shape
     terminal.say(f"{views} views x {realisations} patterns of {pixels} pixels in {out}")
     terminal.say(f"next: wallmirror solve {out} -o {out.with_name(out.name + '_solved')}")
@@ -184,6 +238,10 @@ def solve(
     source_level: Annotated[
         float | None, typer.Option(help="The pattern's mean radiance, if known, for --scale level.")
     ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(help="Error of the pattern that is good enough; exit 1 where the answer is not known so well."),
+    ] = None,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -205,6 +263,7 @@ def solve(
         scale=scale,  # type: ignore[arg-type]
         wall_albedo=wall_albedo,
         source_level=source_level,
+        tolerance=tolerance,
         seed=seed,
     )
     if solved.calibration is not None:
@@ -215,8 +274,11 @@ def solve(
         terminal.say(f"warning: {warning}")
     if solved.judgement is not None:
         terminal.say(f"against the known truth: the pattern is {100 * solved.judgement.source_error:.2g} % off")
+    if solved.shortfall:
+        terminal.say(f"FAILED: {solved.shortfall}")
     terminal.say(f"open {out / 'report.html'}")
     terminal.document(solved.summary())
+    raise typer.Exit(1 if solved.shortfall else 0)
 
 
 @app.command(epilog="Example: wallmirror figures 3.2 3.3 -o out/figures")

@@ -271,6 +271,42 @@ def cross_weights(seeds: Array, reference: Array) -> Array:
     return weights
 
 
+def detectable_gain(
+    seeds: Array,
+    reference: Array,
+    *,
+    planned: int,
+    templates: int = 0,
+    edges: NDArray[np.bool_] | None = None,
+) -> float:
+    """Smallest gain error that `compare` would reject with 99 % power, foretold from fewer seeds than it will have.
+
+    Parameters
+    ----------
+    seeds, reference, edges:
+        As for `compare`, with the pixels' weights that `cross_weights` gives; S >= 8.
+    planned:
+        Seeds that the comparison will have.
+    templates:
+        Biases that it will test beside the gain, which share its level.
+
+    Notes
+    -----
+    A gain's scatter over S seeds is known to 1 / sqrt(2 S - 2) only. Pixels scatter on their own, so that the sum of
+    their squared shares knows it far better.
+    """
+    keep = reference > _STARVED * float(reference.max(initial=0.0))
+    if edges is not None:
+        keep &= ~edges
+    weights = np.where(keep, cross_weights(seeds, reference), 0.0)
+    power = np.einsum("san,an->s", weights, reference**2)
+    if not np.all(power > 0):
+        return math.inf
+    shares = weights * reference * (seeds - reference) / power[:, None, None]
+    error = math.sqrt(float(np.mean(np.sum(shares**2, axis=(1, 2)))) / planned)
+    return max(1e-5 if error < 1e-6 else 0.0, _units(SIGNIFICANCE / (templates + 3), planned) * error + _FLOAT32)
+
+
 def _beyond(values: Array, slack: Array) -> Array:
     """What of the values lies beyond +-slack, with their signs."""
     return np.asarray(np.sign(values) * np.maximum(np.abs(values) - slack, 0.0), dtype=np.float64)

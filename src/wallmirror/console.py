@@ -50,11 +50,11 @@ class Terminal:
         """The one sentence of a failure, on stderr."""
         self._err.print(f"wallmirror: {text}", style="bold red", markup=False)
 
-    def table(self, columns: list[str], rows: list[list[str]]) -> None:
-        """A small table of results; the first column is left-aligned, the others right."""
+    def table(self, columns: list[str], rows: list[list[str]], *, words: int = 1) -> None:
+        """A small table of results; the first columns, `words` of them, are left-aligned, the others right."""
         table = Table(box=None, pad_edge=False, header_style="bold")
         for i, column in enumerate(columns):
-            table.add_column(column, justify="left" if i == 0 else "right", overflow="fold")
+            table.add_column(column, justify="left" if i < words else "right", overflow="fold")
         for row in rows:
             table.add_row(*row)
         self._out.print(table)

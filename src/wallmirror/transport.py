@@ -80,6 +80,7 @@ def build_kernel(
     weights: Weights = "physical",
     resolution: float = math.pi / 4,
     tolerance: float = 1e-6,
+    orders: tuple[int, int] | None = None,
 ) -> Kernel:
     """The kernel of one bounce, with quadrature orders that resolve a BRDF of the given angular scale.
 
@@ -91,6 +92,9 @@ def build_kernel(
         Smallest angular scale of the BRDF (standard deviation of its narrowest lobe) in radians.
     tolerance:
         Largest error wanted, relative to a lobe's peak.
+    orders:
+        Gauss-Legendre nodes across a pixel and across a strip, where they are known; they follow from `resolution` and
+        `tolerance` if left out. One node is the middle: a pixel or strip taken as a line.
 
     Raises
     ------
@@ -99,8 +103,15 @@ def build_kernel(
     """
     if weights not in get_args(Weights):
         raise InputError(f'is "{weights}"; choose one of {", ".join(get_args(Weights))}', field="transport")
-    half_pixel, half_strip, orders = _orders(observer, card, weights, resolution, tolerance)
-    return _kernel(observer, card, weights, half_pixel, half_strip, *orders)
+    half_pixel, half_strip, found = _orders(observer, card, weights, resolution, tolerance)
+    return _kernel(observer, card, weights, half_pixel, half_strip, *(orders or found))
+
+
+def quadrature_orders(
+    observer: Observer, card: Card, *, resolution: float = math.pi / 4, tolerance: float = 1e-6
+) -> tuple[int, int]:
+    """Nodes across a pixel and across a strip that `build_kernel` takes for physical weights, with its parameters."""
+    return _orders(observer, card, "physical", resolution, tolerance)[2]
 
 
 def _orders(

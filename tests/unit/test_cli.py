@@ -71,6 +71,19 @@ def test_solve_leaves_everything_and_says_how_good_it_is(capsys, folder, tmp_pat
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"solution.json", "source.csv", "brdf.csv", "report.html"}
 
 
+def test_solve_says_whether_a_tolerance_was_kept(capsys, folder, tmp_path):
+    code, out, _ = run(capsys, "solve", folder, "-o", tmp_path / "a", "--tolerance", "0.1")
+    assert code == 0
+    assert "FAILED" not in out
+    code, out, _ = run(capsys, "solve", folder, "-o", tmp_path / "b", "--tolerance", "1e-6")
+    assert code == 1
+    assert "times as many samples" in out
+    written = json.loads((tmp_path / "b" / "solution.json").read_text())
+    assert written["tolerance"]["kept"] is False
+    assert written["verdict"] == "good"  # the answer is sound, only not so sharp
+    assert run(capsys, "solve", folder, "-o", tmp_path / "c", "--tolerance", "2")[0] == 2
+
+
 def test_solve_prints_one_json_document(capsys, folder, tmp_path):
     code, out, err = run(capsys, "solve", folder, "-o", tmp_path / "out", "--json")
     document = json.loads(out)
@@ -250,16 +263,20 @@ def test_unknown_scene_and_method_are_exit_2(capsys, folder, tmp_path):
     assert "closed_form" in err
 
 
+def test_advise_refuses_before_it_renders(capsys):
+    assert run(capsys, "advise", "flat_wall_lobes", "--tolerance", "0.9")[0] == 2
+    assert run(capsys, "advise", "flat_wall_lobess")[0] == 2
+    assert run(capsys, "capture", "flat_wall_lobes", "-o", "nowhere", "--tolerance", "1e-9")[0] == 2
+
+
 def test_usage_errors_are_exit_2(capsys):
     assert run(capsys, "solve")[0] == 2
     assert run(capsys, "validate", "--spp", "0")[0] == 2
-    code, _, err = run(capsys, "validate", "flat_wall_lobes", "--tolerance", "0.01")
-    assert code == 2
-    assert "--bounces" in err
+    assert run(capsys, "validate", "flat_wall_lobes", "--tolerance", "0")[0] == 2
     assert run(capsys, "validate", "--bounces", "--tolerance", "1.5")[0] == 2
 
 
-@pytest.mark.parametrize("command", ["demo", "doctor", "validate", "capture", "solve"])
+@pytest.mark.parametrize("command", ["demo", "doctor", "advise", "validate", "capture", "solve"])
 def test_help_has_an_example(capsys, command):
     code, out, _ = run(capsys, command, "--help")
     assert code == 0

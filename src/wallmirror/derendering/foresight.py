@@ -114,7 +114,7 @@ def foresee(
         films = radiance(transport, source).reshape(-1, source.shape[1])
         inverse = 1 / spread.reshape(films.shape) ** 2
         summed = moments(films, designs, inverse)
-        coefficients = _closest(grid, brdf)
+        coefficients = closest_spline(grid, brdf)
         peak_at = grid.peak(coefficients, summed.exposure)
         bound = cramer_rao(summed, coefficients, source, gauge=grid.row(peak_at))
         # F's own error: E |dF|^2 = sum_i tr(T_i Cov T_i^T), less what lies along F, which the scale absorbs.
@@ -136,7 +136,7 @@ def foresee(
     )
 
 
-def _closest(grid: SplineGrid, brdf: AngleSumBRDF) -> Array:
+def closest_spline(grid: SplineGrid, brdf: AngleSumBRDF) -> Array:
     """Coefficients of the spline nearest to a BRDF in the mean square, from four samples a knot interval, shape (K,)."""
     u = np.linspace(grid.start, grid.stop, 4 * grid.size)
     first, values = grid.basis(u)

@@ -38,6 +38,9 @@ _GAP = 1.0
 _PLATEAU = 10.0
 # The pattern may move by this many of its error bars when the knots are halved.
 _STEADY = 3.0
+# Quadrature of the fit, of a lobe's peak; and the share of a tolerance below which a move of the pattern is none.
+_FINEST_QUADRATURE = 1e-5
+_SETTLED = 0.25
 
 
 @dataclass(frozen=True)
@@ -73,16 +76,23 @@ def solve_noisy(
     steps: tuple[float, ...] = NOISY_STEPS,
     *,
     nonnegative: bool = True,
+    tolerance: float | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Estimate:
     """The best fit over the knot spacings, with error bars from its bound and doubts from its misfit.
+
+    Parameters
+    ----------
+    tolerance:
+        Relative error of the pattern that is good enough: knots are halved no further once the noise is reached and the
+        last halving moved the pattern by a quarter of it, and the quadrature is no finer than it needs.
 
     Raises
     ------
     UndeterminedError
         If fewer patterns than elements stand out of the noise, or no knots are coarse enough to be determined.
     """
-    refined = refine(problem, space, steps, nonnegative=nonnegative, tell=tell)
+    refined = refine(problem, space, steps, nonnegative=nonnegative, tolerance=tolerance, tell=tell)
     level, rival = refined.level, refined.rival
     grid, fit, bound = level.grid, level.fit, level.bound
     transport = np.stack([t @ fit.coefficients for t in level.designs], axis=1)
@@ -151,13 +161,14 @@ def refine(
     steps: tuple[float, ...],
     *,
     nonnegative: bool,
+    tolerance: float | None = None,
     tell: Callable[[str], None],
 ) -> Refined:
     """Halve the knot spacing while that pays, and go back where the bound says that nothing determines the finest."""
     begin = _first_worth_a_fit(problem, space, steps)
     while True:
         try:
-            levels, rival = _halve(problem, space, steps[begin:], nonnegative, tell)
+            levels, rival = _halve(problem, space, steps[begin:], nonnegative, tolerance, tell)
         except UndeterminedError:
             if begin == 0 and space.rank < problem.card.elements:
                 raise too_few_patterns(space.rank, problem.card.elements) from None
@@ -190,15 +201,17 @@ def _halve(
     space: SignalSpace,
     steps: tuple[float, ...],
     nonnegative: bool,
+    tolerance: float | None,
     tell: Callable[[str], None],
 ) -> tuple[list[Level], Fit | None]:
     """The levels taken, and the fit on finer knots that were not."""
     levels: list[Level] = []
     rival: Fit | None = None
     idle = 0
+    quadrature = _quadrature(problem, tolerance)
     for step in steps:
         best = levels[-1] if levels else None
-        grid, designs = problem.designs(step, degree=_DEGREE, tolerance=1e-5)
+        grid, designs = problem.designs(step, degree=_DEGREE, tolerance=quadrature)
         summed = moments(problem.data, designs, problem.inverse_variance)
         try:
             fit = closed = None
@@ -220,14 +233,32 @@ def _halve(
             rival = rival or fit
             # One idle halving ends the search, unless the noise is known and not yet reached.
             idle += 1
-            observations = best.summed.observations
-            reached = best.fit.objective < observations + 4 * math.sqrt(2 * observations)
-            if idle == 2 or (reached if problem.noise_is_stated else step < steps[1]):
+            if idle == 2 or (_at_the_noise(best) if problem.noise_is_stated else step < steps[1]):
                 break
             continue
         levels.append(Level(grid, designs, summed, closed, fit))
         rival, idle = None, 0
+        if tolerance is not None and best is not None and problem.noise_is_stated and _at_the_noise(levels[-1]):
+            moved = scale_free_error(best.fit.source, fit.source)
+            if moved <= _SETTLED * tolerance:
+                tell(f"the pattern moved by {moved:.1e} only: knots are fine enough for {tolerance:g}")
+                break
     return levels, rival
+
+
+def _quadrature(problem: Problem, tolerance: float | None) -> float:
+    """Quadrature error, of a lobe's peak, that a tolerance of the pattern allows and the noise hides."""
+    if tolerance is None or problem.inverse_variance is None or not problem.noise_is_stated:
+        return _FINEST_QUADRATURE
+    weights = problem.inverse_variance[problem.inverse_variance > 0]
+    hidden = 0.1 / math.sqrt(float(np.median(weights)))
+    return min(1e-3, max(_FINEST_QUADRATURE, min(1e-2 * tolerance, hidden)))
+
+
+def _at_the_noise(level: Level) -> bool:
+    """Whether the misfit is what the stated noise makes."""
+    observations = level.summed.observations
+    return level.fit.objective < observations + 4 * math.sqrt(2 * observations)
 
 
 def _first_worth_a_fit(problem: Problem, space: SignalSpace, steps: tuple[float, ...]) -> int:

@@ -40,6 +40,7 @@ class SolveOptions(TypedDict, total=False):
     scale: Scale
     wall_albedo: float | None
     source_level: float | None
+    tolerance: float | None
     seed: int
 
 
@@ -63,6 +64,7 @@ def solve(
     scale: Scale = "peak",
     wall_albedo: float | None = None,
     source_level: float | None = None,
+    tolerance: float | None = None,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Solution:
@@ -90,6 +92,9 @@ def solve(
     wall_albedo:
         The wall's directional albedo at normal incidence, if known: sets the scale of the check of Hypothesis 2, which
         runs where card or room reflect.
+    tolerance:
+        Relative error of the pattern that is good enough, for maximum likelihood: it sets the quadrature and ends the
+        search for finer knots. Whether the answer keeps it, `predicted_error` tells.
     seed:
         Of the random starts of the search for few captures.
     progress:
@@ -114,6 +119,8 @@ def solve(
     """
     started = time.perf_counter()
     few = method == "few_captures" or (method == "auto" and captures.realisations < captures.card.elements)
+    if tolerance is not None and not 0 < tolerance < 1:
+        raise InputError(f"is {tolerance:g}; give a relative error between 0 and 1", field="tolerance")
     _check_options(method, few, support_deg, step_deg, counts_per_radiance, background, seed)
     gauge = Gauge(scale=scale, wall_albedo=wall_albedo, source_level=source_level)
     steps = (step_deg,) if step_deg else None
@@ -165,7 +172,9 @@ def solve(
         if estimate is None:
             tell("maximum likelihood")
             try:
-                estimate = solve_noisy(problem, space, steps or NOISY_STEPS, nonnegative=nonnegative, tell=tell)
+                estimate = solve_noisy(
+                    problem, space, steps or NOISY_STEPS, nonnegative=nonnegative, tolerance=tolerance, tell=tell
+                )
             except UndeterminedError:
                 if not quiet or exact is None:
                     raise

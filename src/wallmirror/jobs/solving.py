@@ -51,6 +51,26 @@ class Solved:
     truth: Truth | None
     judgement: Judgement | None
     calibration: Calibration | None = None
+    tolerance: float | None = None
+
+    @property
+    def shortfall(self) -> str:
+        """Why the pattern is not known to the tolerance, with what would help; empty where it is, or none was asked for."""
+        s, tolerance = self.solution, self.tolerance
+        if tolerance is None:
+            return ""
+        if s.one_bounce is not None and s.one_bounce.bias > tolerance:
+            return (
+                f"light beyond one bounce is foretold to move the pattern by {100 * s.one_bounce.bias:.2g} %, more than the "
+                f"{100 * tolerance:.3g} % asked for; no samples mend that, a darker card or room does"
+            )
+        if s.predicted_error > tolerance:
+            more = (s.predicted_error / tolerance) ** 2
+            return (
+                f"the pattern is known to {100 * s.predicted_error:.2g} %, not to the {100 * tolerance:.3g} % asked for; about "
+                f"{more:.2g} times as many samples a pixel, or views, would do"
+            )
+        return ""
 
     def summary(self) -> dict[str, Any]:
         """The JSON document of the command."""
@@ -60,6 +80,8 @@ class Solved:
                 "source_error": self.judgement.source_error,
                 "brdf_error": None if math.isnan(self.judgement.brdf_error) else self.judgement.brdf_error,
             }
+        if self.tolerance is not None:
+            document["tolerance"] = {"asked": self.tolerance, "kept": not self.shortfall, "why": self.shortfall}
         if self.calibration is not None:
             document["calibration"] = {
                 "status": self.calibration.status,
@@ -102,7 +124,7 @@ def solve_directory(
         calibration = calibrate(captures, progress=progress)
         captures = replace(captures, card=calibration.card)
     solution = solve(captures, progress=progress, **options)
-    solved = Solved(captures, solution, truth, judge(solution, truth), calibration)
+    solved = Solved(captures, solution, truth, judge(solution, truth), calibration, options.get("tolerance"))
     write_solution(out, solved)
     return solved
 
@@ -176,6 +198,8 @@ def verdicts(solved: Solved) -> list[Verdict]:
                 f"said {100 * solution.predicted_error:.2g} %.",
             )
         )
+    if solved.shortfall:
+        lines.append(Verdict(False, solved.shortfall[0].upper() + solved.shortfall[1:] + "."))
     lines.extend(Verdict(False, warning[0].upper() + warning[1:] + ".") for warning in solution.warnings)
     if not solution.warnings:
         lines.append(Verdict(True, "No certificate objects: rank, mismatch, misfit and the one-bounce check agree."))

@@ -55,6 +55,8 @@ class Validation:
         analytic radiances over the largest radiance. The comparison is with the table and does not contain it.
     same_as:
         Name of the scene whose render this is, where two differ in nothing that one bounce meets; else empty.
+    tolerance:
+        Gain error that the run was to see, if one was asked for.
     """
 
     scene: Scene
@@ -66,11 +68,17 @@ class Validation:
     seconds: float
     interpolation: float
     same_as: str = ""
+    tolerance: float | None = None
 
     @property
     def passed(self) -> bool:
-        """Whether the model was not rejected."""
-        return self.comparison.passed
+        """Whether the model was not rejected, by a run that would have seen a gain error of the tolerance, if one is set."""
+        return self.comparison.passed and self.fine_enough
+
+    @property
+    def fine_enough(self) -> bool:
+        """Whether a gain error of the tolerance would have shown; True where none is set."""
+        return self.tolerance is None or self.comparison.gain.detectable <= self.tolerance
 
     def summary(self) -> dict[str, Any]:
         """The scene's part of results.json."""
@@ -80,6 +88,7 @@ class Validation:
             "seeds": SEEDS,
             "spp_per_seed": self.spp,
             "same_as": self.same_as or None,
+            "tolerance": self.tolerance,
             "seconds": self.seconds,
             "table_interpolation": self.interpolation,
             **self.comparison.summary(),
@@ -166,20 +175,21 @@ def render_seeds(
     spp: int,
     seed: int = 0,
     realisation: int = 0,
+    count: int = SEEDS,
     variant: str = "llvm_ad_mono",
     progress: Advance | None = None,
 ) -> Sample:
-    """The rendered side, with parameters as for `validate_scene`."""
-    count = scene.observer.views
-    chosen = tuple(int(v) for v in np.unique(np.linspace(0, count - 1, views).round().astype(int)))
+    """The rendered side, with parameters as for `validate_scene`, and `count` seeds."""
+    last = scene.observer.views - 1
+    chosen = tuple(int(v) for v in np.unique(np.linspace(0, last, views).round().astype(int)))
     # Looking through a board displaces what is seen by a hundredth of a pixel (see `building`), which this test would
     # notice. At one bounce the board has no other effect, so it is taken away.
     bare = replace(scene, card=replace(scene.card, board_width=0.0, board_height=0.0))
     renderer = Renderer(bare, variant=variant)
-    roots = spread_seeds(seed, len(chosen) * SEEDS)
-    seeds = np.empty((SEEDS, len(chosen), scene.observer.pixels))
+    roots = spread_seeds(seed, len(chosen) * count)
+    seeds = np.empty((count, len(chosen), scene.observer.pixels))
     for a, view in enumerate(chosen):
-        mine = roots[a * SEEDS : (a + 1) * SEEDS]
+        mine = roots[a * count : (a + 1) * count]
         pattern = scene.source[:, realisation]
         render = renderer.render(view, pattern, spp=spp, seeds=mine, max_depth=2, sampler="multijitter", method="seeds")
         seeds[:, a] = render.per_seed
@@ -291,14 +301,25 @@ def validate_scenes(
     scenes: list[Scene],
     out: Path,
     *,
-    views: int = VIEWS,
-    spp: int = SPP,
+    views: int | None = None,
+    spp: int | None = None,
+    tolerance: float | None = None,
+    effort: Callable[[Scene], tuple[int, int]] = lambda _: (VIEWS, SPP),
     seed: int = 0,
     progress: Advance | None = None,
 ) -> list[Validation]:
     """Validate several scenes; leaves results.json and report.html in a folder.
 
     Scenes that one bounce cannot tell apart (a white card or a black one) are rendered once.
+
+    Parameters
+    ----------
+    views, spp:
+        As for `validate_scene`; those of `effort` where left out.
+    tolerance:
+        Gain error that each run must be able to see, or else does not pass.
+    effort:
+        Views and samples per pixel for a scene, such as a plan's.
     """
     results: list[Validation] = []
     rendered: dict[bytes, Validation] = {}
@@ -306,7 +327,9 @@ def validate_scenes(
         met = _met_at_one_bounce(scene)
         earlier = rendered.get(met)
         if earlier is None:
-            rendered[met] = validate_scene(scene, views=views, spp=spp, seed=seed)
+            planned = effort(scene) if views is None or spp is None else (views, spp)
+            found = validate_scene(scene, views=views or planned[0], spp=spp or planned[1], seed=seed)
+            rendered[met] = replace(found, tolerance=tolerance)
             results.append(rendered[met])
         else:
             results.append(replace(earlier, scene=scene, seconds=0.0, same_as=earlier.scene.name))
@@ -333,12 +356,17 @@ def _met_at_one_bounce(scene: Scene) -> bytes:
 def verdict(result: Validation) -> Verdict:
     """One sentence on one scene."""
     gain = result.comparison.gain
-    if result.comparison.exact:
+    if result.comparison.exact and result.fine_enough:
         text = f"{result.scene.name}: agrees to {result.comparison.relative_rms:.1e} of the brightest pixel"
     elif result.passed:
         text = (
             f"{result.scene.name}: model and Mitsuba are not told apart; gain - 1 = {gain.estimate:+.1e} ± "
             f"{gain.standard_error:.0e}, and a gain error of {gain.detectable:.0e} would have been caught"
+        )
+    elif result.comparison.passed:
+        text = (
+            f"{result.scene.name}: TOO COARSE; not told apart, but only a gain error of {gain.detectable:.1e} would have been "
+            f"caught, not {result.tolerance:g}; take more views or samples"
         )
     else:
         text = f"{result.scene.name}: REJECTED; gain - 1 = {gain.estimate:+.1e} ± {gain.standard_error:.0e}"

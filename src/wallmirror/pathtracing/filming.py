@@ -8,11 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet
+from wallmirror.pathtracing.cameras import Sampler
 from wallmirror.pathtracing.rendering import Renderer, spread_seeds
 from wallmirror.scene import Scene
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
+
+# Neighbours whose scatter steadies that of a pixel, and how many seeds their mean is worth.
+_NEIGHBOURS = 5
+_PRIOR_SEEDS = 20
 
 
 def render_captures(
@@ -22,6 +27,8 @@ def render_captures(
     seed: int = 0,
     max_depth: int | None = None,
     rr_depth: int | None = None,
+    sampler: Sampler = "independent",
+    seeds: int = 1,
     variant: str = "llvm_ad_mono",
     progress: Progress | None = None,
 ) -> CaptureSet:
@@ -30,15 +37,19 @@ def render_captures(
     Parameters
     ----------
     spp, max_depth, rr_depth:
-        Samples per pixel of each capture, and the depths; the scene's own where left out.
+        Samples per pixel of each seed, and the depths; the scene's own where left out.
     seed:
         Root of all seeds, any integer >= 0.
+    sampler, seeds:
+        How samples are drawn, and how many seeds are averaged in each capture. Stratified samples need several, from
+        whose scatter, steadied by that of the neighbouring pixels, their variance is known.
     progress:
         Called with (captures done, captures in all).
 
     Returns
     -------
-    Radiance and variance, both (A, N, B), with the geometry; the variance is that of `Render.moment_variance`.
+    Radiance and variance, both (A, N, B), with the geometry; the variance is that of `Render.moment_variance` for
+    independent samples.
     """
     renderer = Renderer(scene, variant=variant)
     settings = scene.render
@@ -47,21 +58,23 @@ def render_captures(
     rr_depth = settings.rr_depth if rr_depth is None else rr_depth
     views, pixels, realisations = scene.observer.views, scene.observer.pixels, scene.source.shape[1]
     radiance, variance = np.empty((2, views, pixels, realisations))
-    seeds = spread_seeds(seed, views * realisations)
-    for done, pass_seed in enumerate(seeds):
+    roots = spread_seeds(seed, views * realisations * seeds)
+    for done in range(views * realisations):
         view, realisation = divmod(done, realisations)
         render = renderer.render(
             view,
             scene.source[:, realisation],
             spp=spp,
-            seeds=(pass_seed,),
+            seeds=roots[done * seeds : (done + 1) * seeds],
             max_depth=max_depth,
             rr_depth=rr_depth,
+            sampler=sampler,
         )
         radiance[view, :, realisation] = render.mean
-        variance[view, :, realisation] = render.variance
+        known = render.method == "moments"
+        variance[view, :, realisation] = render.variance if known else steadied(render.variance, seeds)
         if progress is not None:
-            progress(done + 1, len(seeds))
+            progress(done + 1, views * realisations)
     runtime = renderer.runtime
     return CaptureSet(
         observer=scene.observer,
@@ -72,12 +85,21 @@ def render_captures(
         provenance={
             "scene": scene.name,
             "renderer": f"mitsuba {runtime.mitsuba_version} {runtime.variant}",
-            "spp": str(spp),
+            "spp": str(spp * seeds),
+            **({} if sampler == "independent" else {"sampler": sampler}),
+            **({} if seeds == 1 else {"seeds": str(seeds)}),
             "max_depth": str(max_depth),
             "rr_depth": str(rr_depth),
             "seed": str(seed),
         },
     )
+
+
+def steadied(variance: Array, seeds: int) -> Array:
+    """The seeds' variance, shape (N,), drawn towards the mean of the neighbours: a few seeds know it but roughly."""
+    wide = np.pad(variance, _NEIGHBOURS // 2, mode="edge")
+    around = np.lib.stride_tricks.sliding_window_view(wide, _NEIGHBOURS).mean(axis=-1)
+    return np.asarray(((seeds - 1) * variance + _PRIOR_SEEDS * around) / (seeds - 1 + _PRIOR_SEEDS))
 
 
 def render_one_hot(

@@ -284,9 +284,14 @@ def spread_seeds(root: int, count: int) -> list[int]:
 
 def _passes(spp: int, pixels: int) -> list[int]:
     """Samples per pixel of each pass: powers of two and a rest (see the notes on `Renderer`)."""
-    largest = max(1, min(_PASS_SAMPLES, 2 ** int(math.log2(_PASS_RAYS / pixels)) if pixels < _PASS_RAYS else 1))
+    largest = largest_pass(pixels)
     rest = spp % largest
     return [largest] * (spp // largest) + ([rest] if rest else [])
+
+
+def largest_pass(pixels: int) -> int:
+    """Most samples per pixel that one pass over `pixels` pixels takes, a power of two."""
+    return max(1, min(_PASS_SAMPLES, 2 ** int(math.log2(_PASS_RAYS / pixels)) if pixels < _PASS_RAYS else 1))
 
 
 def _moment_variance(first: Array, second: Array, samples: int) -> Array:
