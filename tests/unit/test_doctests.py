@@ -10,6 +10,7 @@ import wallmirror
 import wallmirror.brdf
 import wallmirror.captures
 import wallmirror.convolution
+import wallmirror.deconvolution
 import wallmirror.derendering
 
 CORE = sorted(
@@ -19,6 +20,7 @@ CORE = sorted(
         wallmirror.brdf,
         wallmirror.captures,
         wallmirror.convolution,
+        wallmirror.deconvolution,
         wallmirror.derendering,
     )
     for module in pkgutil.iter_modules(package.__path__, package.__name__ + ".")
