@@ -18,6 +18,7 @@ from typing import Literal, get_args
 import numpy as np
 import scipy.linalg as sl
 from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import threadpool_limits
 
 from wallmirror.deconvolution.channels import checked_outputs, finite_array
 from wallmirror.errors import InputError, UndeterminedError
@@ -103,16 +104,17 @@ def identify_channels(
         raise UndeterminedError(
             f"{rows} equations cannot determine {channels} channels of {taps} taps; give longer records or fewer taps"
         )
-    if method == "cross_relation":
-        matrix = _cross_relation_gram(g, taps)
-    else:
-        matrix, rows = _subspace_gram(g, taps, window)
-    values, vectors = np.linalg.eigh(matrix)
-    _require_one_answer(values, taps)
-    h = vectors[:, 0].reshape(channels, taps)
-    smallest = max(float(values[0]), 0.0)
-    if method == "cross_relation":
-        h, smallest = _refined(g, h, values, vectors)
+    with threadpool_limits(limits=1, user_api="blas"):  # two threads that wait for each other are far slower
+        if method == "cross_relation":
+            matrix = _cross_relation_gram(g, taps)
+        else:
+            matrix, rows = _subspace_gram(g, taps, window)
+        values, vectors = np.linalg.eigh(matrix)
+        _require_one_answer(values, taps)
+        h = vectors[:, 0].reshape(channels, taps)
+        smallest = max(float(values[0]), 0.0)
+        if method == "cross_relation":
+            h, smallest = _refined(g, h, values, vectors)
     h = h if h.sum() >= 0 else -h
     # K (K - 1) / 2 equations a sample share the noise of K outputs, so that only K - 1 of them count.
     noise = smallest / max(1.0, rows * 2 / channels - unknowns)
@@ -138,7 +140,8 @@ def rival_channels(outputs: ArrayLike, taps: int) -> int:
     >>> rival_channels(g, 5), rival_channels(g, 7)
     (1, 3)
     """
-    values = np.linalg.eigvalsh(_cross_relation_gram(_records(outputs, taps), taps))
+    with threadpool_limits(limits=1, user_api="blas"):  # two threads that wait for each other are far slower
+        values = np.linalg.eigvalsh(_cross_relation_gram(_records(outputs, taps), taps))
     best = max(float(values[0]), _ZERO * float(values[-1]))
     return max(1, int(np.count_nonzero(values <= best / _SEPARATED)))
 

@@ -106,7 +106,7 @@ def focused_blind(
     InputError
         For outputs that are no finite (K, L) array, or channels longer than the record.
     UndeterminedError
-        For one output, darkness, or outputs that are multiples of one.
+        For one output, darkness, outputs that are multiples of one, or a first stage that leaves no channel any energy.
 
     Examples
     --------

@@ -43,7 +43,7 @@ def cross_correlations(signals: ArrayLike) -> Array:
     return correlations
 
 
-def identity_error(outputs: ArrayLike, source: ArrayLike, channels: ArrayLike) -> float:
+def identity_error(outputs: ArrayLike, source: ArrayLike, channels: ArrayLike, *, free_scale: bool = False) -> float:
     """|g_ij - f_a * h_ij| / |g_ij| over all pairs and lags: 0 for convolutions, the test of section 3.2.4.
 
     Parameters
@@ -52,6 +52,8 @@ def identity_error(outputs: ArrayLike, source: ArrayLike, channels: ArrayLike) -
         g, shape (K, L).
     source, channels:
         f (S,) and h (K, n) with S + n - 1 = L.
+    free_scale:
+        Give f_a * h_ij the scale that fits best, where outputs and factors have units of their own.
 
     Examples
     --------
@@ -73,4 +75,6 @@ def identity_error(outputs: ArrayLike, source: ArrayLike, channels: ArrayLike) -
     outputs_spectra, channel_spectra = rfft(g, size), rfft(h, size)
     recorded = irfft(outputs_spectra[i] * np.conj(outputs_spectra[j]), size)
     predicted = irfft(np.abs(rfft(f, size)) ** 2 * channel_spectra[i] * np.conj(channel_spectra[j]), size)
+    if free_scale:
+        predicted *= np.sum(recorded * predicted) / max(float(np.sum(predicted * predicted)), 1e-300)
     return float(np.linalg.norm(recorded - predicted) / np.linalg.norm(recorded))

@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from wallmirror.deconvolution.channels import finite_array
 from wallmirror.deconvolution.interferometry import pairs
 from wallmirror.deconvolution.levenberg import descend
-from wallmirror.errors import InputError
+from wallmirror.errors import InputError, UndeterminedError
 
 Array = NDArray[np.float64]
 
@@ -61,6 +61,8 @@ def retrieve_channels(
     ------
     InputError
         If shapes disagree, or the nearest channel has no energy.
+    UndeterminedError
+        For a table in which no channel has energy.
 
     Examples
     --------
@@ -78,6 +80,11 @@ def retrieve_channels(
             field="correlations",
         )
     problem = _Problem(h_ij, channels)
+    if not np.any(problem.power > 0):
+        raise UndeterminedError(
+            "no channel has a positive auto-correlation at lag 0, so these are correlations of no channels; the "
+            "interferometric fit has failed on outputs that are too short, too noisy or too far from white channels"
+        )
     if nearest is None:
         nearest = problem.leading_channel()
     if not 0 <= nearest < channels or problem.power[nearest] <= 0:
@@ -113,7 +120,8 @@ class _Problem:
         """The channel k whose others lag behind it: h_jk has the largest share of its energy at t >= 0."""
         energy = np.sum(self.table[:, :, : self.taps] ** 2, axis=(0, 2))
         total = np.sum(self.table**2, axis=(0, 2))
-        return int(np.argmax(np.divide(energy, total, out=np.zeros_like(total), where=total > 0)))
+        share = np.divide(energy, total, out=np.zeros_like(total), where=total > 0)
+        return int(np.argmax(np.where(self.power > 0, share, -1.0)))
 
     def focused(self, nearest: int) -> Array:
         """h_f a spike at t = 0, the others their correlations with it."""

@@ -18,6 +18,7 @@ _MODULES = (
     "pictures",
     "rendering_as_convolution",
     "far_field",
+    "focused_blind",
 )
 
 
