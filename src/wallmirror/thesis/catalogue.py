@@ -19,6 +19,8 @@ _MODULES = (
     "rendering_as_convolution",
     "far_field",
     "focused_blind",
+    "interferometric_identity",
+    "focused_blind_limits",
 )
 
 
