@@ -21,6 +21,8 @@ _MODULES = (
     "focused_blind",
     "interferometric_identity",
     "focused_blind_limits",
+    "cross_relation",
+    "blind_spherical",
 )
 
 

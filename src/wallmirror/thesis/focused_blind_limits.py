@@ -191,8 +191,8 @@ def front_loading(seed: int) -> ThesisFigure:
                 measured=f"Random channels as little front-loaded as the patterns are found in {at_front:.0%} of the runs, the "
                 f"patterns in {patterns['focused']:.0%}. What they lack is whiteness, since light is positive: less 1/2 they "
                 f"are found in {signed['focused']:.0%}. With the four-lobed BRDF as the source focusing finds "
-                f"{lobed['focused']:.0%}, the cross-relation {lobed['cross-relation']:.0%}. Turned views differ by a shift alone and "
-                f"share every zero: a family of {rotated['rivals']:.0f} dimensions fits, whatever the method.",
+                f"{lobed['focused']:.0%}, the cross-relation {lobed['cross-relation']:.0%}. Turned views differ by a shift "
+                f"alone and share every zero: a family of {rotated['rivals']:.0f} dimensions fits, whatever the method.",
             ),
         ),
     )
