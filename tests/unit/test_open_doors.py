@@ -142,3 +142,12 @@ def test_spherical_designs_refuse():
     films = np.random.default_rng(0).random((1, 1500, 1))
     with pytest.raises(wm.UndeterminedError):
         solve_spherical(wm.CaptureSet(observer=OBSERVER, card=narrow, radiance=films, transport="thesis"))
+
+
+def test_error_bound_covers_a_card_that_is_too_near():
+    """No noise, but a card at 10 to 1,000 m: the prediction for noise is too small, the bound is not."""
+    for distance in (10.0, 100.0, 1000.0):
+        captures, v = captured(even_card(distance), 6)
+        found = solve_far_field(captures)
+        error = wm.scale_free_error(found.source, v)
+        assert found.identified.predicted_error < error < found.identified.error_bound

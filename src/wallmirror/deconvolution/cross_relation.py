@@ -59,6 +59,11 @@ class IdentifiedChannels:
     gap: float
     predicted_error: float
 
+    @property
+    def error_bound(self) -> float:
+        """Relative error that such a misfit could make at worst, as a fault common to all outputs does (Davis-Kahan)."""
+        return self.misfit / max(self.gap, 1e-300)
+
 
 def identify_channels(
     outputs: ArrayLike, taps: int, *, method: ChannelMethod = "cross_relation", window: int | None = None

@@ -48,8 +48,8 @@ class FarField:
         Largest turn of a delta_i along the wall in radians, from the geometry: far field means that it is far below the
         width of the narrowest lobe.
     identified:
-        What the cross-relation says of itself. Its predicted error is that of noise, and too small where `departure`, a fault
-        common to all captures, rules.
+        What the cross-relation says of itself. Its predicted error is that of noise; where `departure` rules, a fault common
+        to all captures, its error bound is the one to go by.
     """
 
     source: Array

@@ -27,9 +27,10 @@ from wallmirror.errors import InputError
 
 Array = NDArray[np.float64]
 
-_MEMORY = 30  # steps that Anderson's mixing combines
+_MEMORY = 60  # steps that Anderson's mixing combines
 _FOCUSED_STEPS = 10  # at alpha > 0, where only the start for the next alpha is wanted
 _AT_REST = 1e-13
+_PATIENCE = 80  # steps without a gain of a thousandth, as where noise is all that is left
 _RIDGE = 1e-14
 
 
@@ -115,6 +116,7 @@ def _mixed_alternation(
     answers: list[Array] = []
     moves: list[Array] = []
     best, best_misfit = f_a, np.inf
+    patience, reached = _PATIENCE, np.inf
     for _ in range(steps):
         h_ij = problem.channels(f_a, weight)
         misfit = problem.misfit(f_a, h_ij)
@@ -125,9 +127,11 @@ def _mixed_alternation(
             # Mixing has gone astray: begin again from the best point, plainly.
             answers, moves, f_a = [], [], best
             h_ij = problem.channels(f_a, weight)
+        patience = _PATIENCE if best_misfit < 0.999 * reached else patience - 1
+        reached = best_misfit if patience == _PATIENCE else reached
         answer = problem.source(h_ij)
         move = answer - f_a
-        if misfit <= target or np.linalg.norm(move) <= _AT_REST * np.linalg.norm(f_a):
+        if misfit <= target or patience == 0 or np.linalg.norm(move) <= _AT_REST * np.linalg.norm(f_a):
             break
         answers, moves = [*answers, answer][-_MEMORY:], [*moves, move][-_MEMORY:]
         f_a = answer

@@ -60,9 +60,9 @@ def retrieve_channels(
     Raises
     ------
     InputError
-        If shapes disagree, or the nearest channel has no energy.
+        If shapes disagree, or there is no such nearest channel.
     UndeterminedError
-        For a table in which no channel has energy.
+        For a table in which no channel, or not the nearest, has energy.
 
     Examples
     --------
@@ -79,6 +79,8 @@ def retrieve_channels(
             "number of lags",
             field="correlations",
         )
+    if nearest is not None and not 0 <= nearest < channels:
+        raise InputError(f"is {nearest}; give the index of one of {channels} channels", field="nearest")
     problem = _Problem(h_ij, channels)
     if not np.any(problem.power > 0):
         raise UndeterminedError(
@@ -87,8 +89,10 @@ def retrieve_channels(
         )
     if nearest is None:
         nearest = problem.leading_channel()
-    if not 0 <= nearest < channels or problem.power[nearest] <= 0:
-        raise InputError(f"is {nearest}; give the index of a channel that has energy", field="nearest")
+    if problem.power[nearest] <= 0:
+        raise UndeterminedError(
+            f"channel {nearest} has no energy in these correlations, so nothing can be focused on it; name another as the nearest"
+        )
     x = problem.focused(nearest).ravel()
     power = float(np.sum(problem.table**2))
     taken = 0
