@@ -22,6 +22,11 @@ _MODULES = (
     "wall_deconvolution",
     "blind_deconvolution",
     "blind_success",
+    "focused_blind",
+    "interferometric_identity",
+    "focused_blind_limits",
+    "cross_relation",
+    "blind_spherical",
 )
 
 
