@@ -91,7 +91,8 @@ def retrieve_channels(
         nearest = problem.leading_channel()
     if problem.power[nearest] <= 0:
         raise UndeterminedError(
-            f"channel {nearest} has no energy in these correlations, so nothing can be focused on it; name another as the nearest"
+            f"channel {nearest} has no energy in these correlations, so nothing can be focused on it; "
+            "name another as the nearest"
         )
     x = problem.focused(nearest).ravel()
     power = float(np.sum(problem.table**2))
