@@ -18,8 +18,14 @@ LIMIT_VARIABLE = "WALLMIRROR_MEMORY_GB"
 _FLOAT = 8
 # Arrays of the kernel's size that live while it is built or applied: three stored, the rest temporary.
 _KERNEL_ARRAYS = 8
-# F at two quadrature orders.
-_TRANSPORT_ARRAYS = 2
+# F at two quadrature orders, and beside it a block of nodes with its temporary arrays.
+_TRANSPORT_ARRAYS, _BLOCK_BYTES = 2, 4e6
+# The films, normalised, weighted, and in their QR factorisation.
+_FILM_ARRAYS = 6
+# Beside degree + 1 basis functions at all nodes: their sums and places, and one element's share with the weight.
+_NODE_ARRAYS = 7
+# Squares of the number of knots: Fisher information, its factors, and the covariance that follows.
+_KNOT_SQUARES = 8
 
 
 def memory_limit() -> float:
@@ -59,9 +65,10 @@ def require_memory(needed: float, what: str) -> None:
 
     Examples
     --------
-    >>> require_memory(1e15, "F of too many pixels")
+    >>> require_memory(1e18, "F of too many pixels")  # doctest: +ELLIPSIS
     Traceback (most recent call last):
-    wallmirror.errors.InputError: memory: F of too many pixels needs 1e+06 GB...
+    ...
+    wallmirror.errors.InputError: memory: F of too many pixels needs 1e+09 GB of memory and ... GB are left; ...
     """
     limit = memory_limit()
     if needed > limit:
@@ -79,7 +86,19 @@ def kernel_bytes(views: int, pixels: int, elements: int, nodes: int) -> float:
 
 def transport_bytes(views: int, pixels: int, elements: int) -> float:
     """Peak of `transport_matrix`, which goes through the nodes block by block."""
-    return float(_FLOAT * _TRANSPORT_ARRAYS) * views * pixels * elements
+    return float(_FLOAT * _TRANSPORT_ARRAYS) * views * pixels * elements + _BLOCK_BYTES
+
+
+def design_bytes(views: int, pixels: int, elements: int, nodes: int, *, degree: int, knots: int) -> float:
+    """Peak of turning a kernel into sparse matrices over B-splines, and of the dense ones that a fit makes of them."""
+    return float(_FLOAT) * (
+        views * pixels * float(elements) * nodes * (degree + _NODE_ARRAYS) + float(_KNOT_SQUARES) * knots**2
+    )
+
+
+def film_bytes(views: int, pixels: int, realisations: int) -> float:
+    """Peak of making a capture set ready to solve, or of filming it: A x N x B radiances with their variances."""
+    return float(_FLOAT * _FILM_ARRAYS) * views * pixels * realisations
 
 
 def _available() -> float:

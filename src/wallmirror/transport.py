@@ -312,13 +312,18 @@ def _extent_in_angle(observer: Observer, card: Card, half_pixel: float, half_str
     if half_pixel == 0 and half_strip == 0:
         return 0.0, 0.0
     parts = np.linspace(-1.0, 1.0, _PARTS + 1)
-    across = wall_points(observer, pixel_tangents(observer)[:, None] + half_pixel * parts)[..., None]
+    t = pixel_tangents(observer)
     strips = np.asarray(card.elements_x)
-    u = outgoing_angles(observer, across) + incident_angles(strips, card.distance, across)
-    pixel = _PARTS * float(np.abs(np.diff(u, axis=2)).max())
-    centre = wall_points(observer)[..., None]
-    ends = [incident_angles(strips + half_strip * part, card.distance, centre) for part in parts]
-    strip = _PARTS * max(float((right - left).max()) for left, right in itertools.pairwise(ends))
+    pixel = strip = 0.0
+    some = max(1, _BLOCK // (t.size * strips.size))
+    for a in range(0, observer.views, some):
+        part = replace(observer, view_angles=observer.view_angles[a : a + some])
+        across = wall_points(part, t[:, None] + half_pixel * parts)[..., None]
+        u = outgoing_angles(part, across) + incident_angles(strips, card.distance, across)
+        pixel = max(pixel, _PARTS * float(np.abs(np.diff(u, axis=2)).max()))
+        centre = across[:, :, _PARTS // 2]
+        ends = (incident_angles(strips + half_strip * node, card.distance, centre) for node in parts)
+        strip = max(strip, _PARTS * max(float((right - left).max()) for left, right in itertools.pairwise(ends)))
     return pixel, strip
 
 

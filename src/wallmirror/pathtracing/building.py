@@ -61,7 +61,7 @@ def wall_as_rendered(scene: Scene) -> BRDF:
     """The wall's BRDF as the path tracer holds it; compare the analytic model with this, not with `scene.wall.brdf`.
 
     Tables keep their nodes where a plugin can hold them; every other model of the angle sum is tabulated on 7201
-    nodes (3e-4 of the peak off for lobes of sigma 1 deg), or for narrower lobes on proportionally more, up to
+    nodes (a lobe of sigma 1 deg is at most 3e-4 of its peak off), or for narrower lobes on proportionally more, up to
     720001. All values are rounded to float32.
 
     Raises
