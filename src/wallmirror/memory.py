@@ -23,7 +23,7 @@ _TRANSPORT_ARRAYS, _BLOCK_BYTES = 2, 4e6
 # The films, normalised, weighted, and in their QR factorisation.
 _FILM_ARRAYS = 6
 # Beside degree + 1 basis functions at all nodes: their sums and places, and one element's share with the weight.
-_NODE_ARRAYS = 7
+_NODE_ARRAYS = 8
 # Squares of the number of knots: Fisher information, its factors, and the covariance that follows.
 _KNOT_SQUARES = 8
 
