@@ -19,9 +19,10 @@ from wallmirror.report.page import Block
 from wallmirror.report.tradeoffs import panel_figures
 from wallmirror.tradeoff.clock import machine, reference_seconds
 from wallmirror.tradeoff.forward import forward
+from wallmirror.tradeoff.inverse import inverse
 from wallmirror.tradeoff.runs import Panel, Statement, to_csv
 
-PANELS: dict[str, Callable[..., Panel]] = {"forward": forward}
+PANELS: dict[str, Callable[..., Panel]] = {"forward": forward, "inverse": inverse}
 _LEAD = (
     "What a second of computing buys, for every way that this library has and for the path tracer it is judged by. All runs "
     "are kept and drawn, failures are crosses, and each conclusion is computed from the runs that stand above it."
