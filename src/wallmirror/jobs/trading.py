@@ -17,12 +17,14 @@ from wallmirror.files import write_atomically
 from wallmirror.report import FigureBlock, Section, TableBlock, Verdict, write_page
 from wallmirror.report.page import Block
 from wallmirror.report.tradeoffs import panel_figures
+from wallmirror.tradeoff.budget import budget
 from wallmirror.tradeoff.clock import machine, reference_seconds
 from wallmirror.tradeoff.forward import forward
 from wallmirror.tradeoff.inverse import inverse
 from wallmirror.tradeoff.runs import Panel, Statement, to_csv
+from wallmirror.tradeoff.scaling import scaling
 
-PANELS: dict[str, Callable[..., Panel]] = {"forward": forward, "inverse": inverse}
+PANELS: dict[str, Callable[..., Panel]] = {"forward": forward, "inverse": inverse, "budget": budget, "scaling": scaling}
 _LEAD = (
     "What a second of computing buys, for every way that this library has and for the path tracer it is judged by. All runs "
     "are kept and drawn, failures are crosses, and each conclusion is computed from the runs that stand above it."

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from wallmirror.report.style import FAINT, INK, OURS, PALE, WARM, clean, new_figure
+from wallmirror.tradeoff.budget import DRAWN, FORETOLD, RENDERED
 from wallmirror.tradeoff.pareto import fit_line, pareto_front, short_seconds
 from wallmirror.tradeoff.runs import Panel, Run, by_method
 
@@ -70,6 +71,10 @@ def panel_figures(panel: Panel) -> list[tuple[Figure, str]]:
     """A figure for each group of a panel, with its caption."""
     if panel.name == "scaling":
         return scaling_figures(panel)
+    if panel.name == "budget":
+        return [
+            (budget_figure(panel), "Lines: foretold by the bound. Marks: measured, of the same colour as their line.")
+        ]
     figures = []
     for group in panel.groups:
         runs = panel.of_group(group)
@@ -80,6 +85,45 @@ def panel_figures(panel: Panel) -> list[tuple[Figure, str]]:
         caption += ". Each line joins the runs of a method that the method itself does not beat; dots are all its runs."
         figures.append((work_precision(runs, title=group, floor=floor, floor_name="Cramér-Rao bound"), caption))
     return figures
+
+
+def budget_figure(panel: Panel) -> Figure:
+    """Error over the number of realisations, a line a number of views, a field a budget; measured errors as marks."""
+    groups = panel.groups
+    columns = min(2, len(groups))
+    rows = math.ceil(len(groups) / columns)
+    figure = new_figure(10.5, 3.4 * rows + 0.5)
+    fields = figure.subplots(rows, columns, squeeze=False).ravel()
+    views = sorted({run.knobs["views"] for run in panel.runs})
+    for axes, group in zip(fields, groups, strict=False):
+        runs = panel.of_group(group)
+        for a, (colour, _) in zip(views, _LOOKS, strict=False):
+            mine = [run for run in runs if run.knobs["views"] == a and not run.failure]
+            line = sorted((run for run in mine if run.method == FORETOLD), key=lambda r: r.knobs["realisations"])
+            axes.plot(
+                [run.knobs["realisations"] for run in line], [run.error for run in line], color=colour, linewidth=1.3,
+                marker=".", markersize=4, label=f"{a} views" if axes is fields[0] else None,
+            )  # fmt: skip
+            for method, shape, size in ((DRAWN, "x", 26), (RENDERED, "D", 34)):
+                dots = [run for run in mine if run.method == method]
+                axes.scatter(
+                    [run.knobs["realisations"] for run in dots], [run.error for run in dots], marker=shape, s=size,
+                    color=colour, zorder=4, linewidths=1.1, facecolor=None if shape == "x" else "white", edgecolor=None
+                    if shape == "x" else colour,
+                )  # fmt: skip
+        _log_axes(axes, seconds=False)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 4)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+        axes.set_xlabel("realisations B")
+        axes.set_ylabel("error of the patterns")
+        axes.set_title(group, fontsize=10.5, color=INK, loc="left")
+        clean(axes)
+    for axes in fields[len(groups) :]:
+        axes.set_axis_off()
+    fields[0].scatter([], [], marker="x", color=INK, s=26, label=DRAWN)
+    fields[0].scatter([], [], marker="D", facecolor="white", edgecolor=INK, s=34, label=RENDERED)
+    figure.legend(frameon=False, fontsize=8.5, loc="outside right upper")
+    return figure
 
 
 def scaling_figures(panel: Panel) -> list[tuple[Figure, str]]:

@@ -231,7 +231,7 @@ def _counted(film: _Film, counts: float) -> _Film:
         observer=film.captures.observer,
         card=film.captures.card,
         transport=_WEIGHTS,
-        radiance=(photons - _BACKGROUND) / counts,
+        radiance=np.asarray((photons - _BACKGROUND) / counts, dtype=np.float64),
     )
     return _Film(captures, film.source, film.sigma, _bound(captures, film.source, np.sqrt(expected) / counts))
 

@@ -22,7 +22,7 @@ _FEWEST = 3  # points of a line whose slope may be trusted
 def pareto_front(runs: Sequence[Run]) -> tuple[Run, ...]:
     """The runs that no other beats in both seconds and error, by rising seconds; failures are none of them."""
     front: list[Run] = []
-    for run in sorted((r for r in runs if not r.failure), key=lambda r: (r.seconds, r.error)):
+    for run in sorted((r for r in runs if math.isfinite(r.error)), key=lambda r: (r.seconds, r.error)):
         if not front or run.error < front[-1].error:
             front.append(run)
     return tuple(front)

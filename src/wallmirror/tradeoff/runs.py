@@ -30,7 +30,7 @@ class Run:
     wall_seconds:
         Time on the wall clock.
     error:
-        Relative error against the group's reference; NaN for a failure.
+        Relative error against the group's reference; NaN for a failure, and where only the cost is asked for.
     work:
         How much of what costs time the run did (samples, say), where that is a number; the error's slope is told over it.
     failure:
@@ -50,8 +50,8 @@ class Run:
     extra: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if bool(self.failure) == math.isfinite(self.error):
-            raise InputError("needs a finite error or the reason of its failure, and not both", field="error")
+        if self.failure and not math.isnan(self.error):
+            raise InputError("is no error of a run that failed; leave it out", field="error")
 
     @property
     def setting(self) -> str:
