@@ -300,6 +300,33 @@ def figures(
     terminal.document({"figures": [one.summary() for one in made]})
 
 
+@app.command(epilog="Example: wallmirror tradeoff forward --quick -o out/tradeoff")
+def tradeoff(
+    panels: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[PANEL]...", help="forward, inverse, budget, scaling; all if left out."),
+    ] = None,
+    out: Out = Path("out/tradeoff"),
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer and smaller runs, within a minute.")] = False,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Measure what a second buys: error against seconds of models, path tracer and solvers, and what sizes cost."""
+    from wallmirror.jobs.trading import measure_tradeoffs
+
+    terminal = Terminal(as_json=as_json)
+    with terminal.progress("measuring, per cent") as advance:
+        traded = measure_tradeoffs(panels or (), out, quick=quick, seed=seed, progress=advance)
+    for panel in traded.panels:
+        terminal.say(panel.title, style="bold")
+        for statement in panel.conclusions:
+            mark = {True: "ok    ", False: "FAIL  ", None: "      "}[statement.met]
+            terminal.say(mark + statement.text)
+    terminal.say(f"{'PASSED' if traded.passed else 'FAILED'} in {traded.seconds:.0f} s; open {out / 'tradeoff.html'}")
+    terminal.document(traded.summary())
+    raise typer.Exit(0 if traded.passed else 1)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run a command and leave with its exit code; every foreseen failure is one sentence."""
     given = sys.argv[1:] if arguments is None else arguments

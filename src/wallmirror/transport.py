@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -36,6 +36,7 @@ from wallmirror.geometry import (
     pixel_tangents,
     wall_points,
 )
+from wallmirror.memory import kernel_bytes, require_memory, transport_bytes
 
 #: What stands in front of the BRDF; see the module's text.
 Weights = Literal["thesis", "cosine", "physical"]
@@ -43,6 +44,7 @@ Weights = Literal["thesis", "cosine", "physical"]
 _PARTS = 4  # of a pixel or strip, over which the speed of u is measured
 _WEIGHT_SCALE = 0.35  # radians
 _MAX_ORDER = 256
+_BLOCK = 1 << 14  # nodes: their dozen temporary arrays stay in a cache of 2 MB
 
 
 @dataclass(frozen=True)
@@ -99,33 +101,24 @@ def build_kernel(
     Raises
     ------
     InputError
-        If the strips or pixels are so wide against `resolution` that more than 256 nodes would be needed.
+        If the strips or pixels are so wide against `resolution` that more than 256 nodes would be needed, or the kernel
+        is larger than the memory.
     """
-    if weights not in get_args(Weights):
-        raise InputError(f'is "{weights}"; choose one of {", ".join(get_args(Weights))}', field="transport")
-    half_pixel, half_strip, found = _orders(observer, card, weights, resolution, tolerance)
-    return _kernel(observer, card, weights, half_pixel, half_strip, *(orders or found))
+    nodes = _Nodes.of(observer, card, weights)
+    orders = nodes.orders(resolution, tolerance) if orders is None else nodes.checked(orders)
+    require_memory(
+        kernel_bytes(observer.views, observer.pixels, card.elements, orders[0] * orders[1]),
+        f"the kernel of {observer.views} views x {observer.pixels} pixels x {card.elements} elements x "
+        f"{orders[0] * orders[1]} nodes",
+    )
+    return nodes.kernel(orders)
 
 
 def quadrature_orders(
     observer: Observer, card: Card, *, resolution: float = math.pi / 4, tolerance: float = 1e-6
 ) -> tuple[int, int]:
     """Nodes across a pixel and across a strip that `build_kernel` takes for physical weights, with its parameters."""
-    return _orders(observer, card, "physical", resolution, tolerance)[2]
-
-
-def _orders(
-    observer: Observer, card: Card, weights: Weights, resolution: float, tolerance: float
-) -> tuple[float, float, tuple[int, int]]:
-    """Half widths of pixel (in tangents) and strip (in metres), and the quadrature orders along both."""
-    points = weights != "physical"
-    half_pixel = 0.0 if points else pixel_half_width(observer)
-    half_strip = 0.0 if points else card.element_width / 2
-    pixel_turn, strip_turn = _extent_in_angle(observer, card, half_pixel, half_strip)
-    # The weight in front of the BRDF varies over angles as well, about as a lobe of this width does.
-    scale = 1 / math.hypot(1 / resolution, 1 / _WEIGHT_SCALE)
-    orders = quadrature_order(pixel_turn / scale, tolerance), quadrature_order(strip_turn / scale, tolerance)
-    return half_pixel, half_strip, orders
+    return _Nodes.of(observer, card, "physical").orders(resolution, tolerance)
 
 
 def transport_matrix(
@@ -135,6 +128,7 @@ def transport_matrix(
     *,
     weights: Weights = "physical",
     tolerance: float = 1e-9,
+    orders: tuple[int, int] | None = None,
 ) -> Array:
     """F of section 4.1.2 for a known BRDF, shape (A, N, M).
 
@@ -143,7 +137,14 @@ def transport_matrix(
     weights:
         "thesis", "cosine" or "physical".
     tolerance:
-        Quadrature error wanted, relative to the largest entry: the orders double until F moves by less.
+        Quadrature error wanted, relative to the largest entry: the orders grow until F moves by less.
+    orders:
+        Nodes across a pixel and across a strip, to evaluate F once with these whatever the error; see `build_kernel`.
+
+    Raises
+    ------
+    InputError
+        If more than 256 nodes would be needed, or F is larger than the memory.
 
     Examples
     --------
@@ -152,21 +153,30 @@ def transport_matrix(
     >>> transport_matrix(scene.observer, scene.card, scene.wall.brdf).shape
     (20, 500, 4)
     """
+    require_memory(
+        transport_bytes(observer.views, observer.pixels, card.elements),
+        f"F of {observer.views} views x {observer.pixels} pixels x {card.elements} elements",
+    )
     if isinstance(brdf, Mirror):
         return mirror_matrix(observer, card, brdf, weights=weights)
-    half_pixel, half_strip, orders = _orders(observer, card, weights, brdf.angular_scale, tolerance)
-    coarse = _kernel(observer, card, weights, half_pixel, half_strip, *orders).apply(brdf)
+    nodes = _Nodes.of(observer, card, weights)
+    if orders is not None:
+        return nodes.transport(nodes.checked(orders), brdf)
+    orders = nodes.orders(brdf.angular_scale, tolerance)
+    coarse = nodes.transport(orders, brdf)
     # The orders are those for Gaussian lobes; half as many again must agree on this BRDF and this geometry.
-    while half_pixel > 0 or half_strip > 0:
-        orders = _more(orders[0], half_pixel), _more(orders[1], half_strip)
+    while nodes.half_pixel > 0 or nodes.half_strip > 0:
+        orders = _more(orders[0], nodes.half_pixel), _more(orders[1], nodes.half_strip)
         if max(orders) > _MAX_ORDER:
             raise InputError(
                 f"a strip or pixel needs more than {_MAX_ORDER} quadrature nodes to reach {tolerance:g}; narrow the "
                 "strips, use more pixels or accept a larger tolerance",
                 field="card.element_width",
             )
-        fine = _kernel(observer, card, weights, half_pixel, half_strip, *orders).apply(brdf)
-        if np.max(np.abs(fine - coarse), initial=0.0) <= tolerance * np.max(np.abs(fine), initial=0.0):
+        fine = nodes.transport(orders, brdf)
+        largest = np.max(np.abs(fine), initial=0.0)
+        np.subtract(coarse, fine, out=coarse)
+        if np.max(np.abs(coarse, out=coarse), initial=0.0) <= tolerance * largest:
             return fine
         coarse = fine
     return coarse
@@ -309,64 +319,168 @@ def _extent_in_angle(observer: Observer, card: Card, half_pixel: float, half_str
     if half_pixel == 0 and half_strip == 0:
         return 0.0, 0.0
     parts = np.linspace(-1.0, 1.0, _PARTS + 1)
-    across = wall_points(observer, pixel_tangents(observer)[:, None] + half_pixel * parts)[..., None]
+    t = pixel_tangents(observer)
     strips = np.asarray(card.elements_x)
-    u = outgoing_angles(observer, across) + incident_angles(strips, card.distance, across)
-    pixel = _PARTS * float(np.abs(np.diff(u, axis=2)).max())
-    centre = wall_points(observer)[..., None]
-    ends = [incident_angles(strips + half_strip * part, card.distance, centre) for part in parts]
-    strip = _PARTS * max(float((right - left).max()) for left, right in itertools.pairwise(ends))
+    pixel = strip = 0.0
+    some = max(1, _BLOCK // (t.size * strips.size))
+    for a in range(0, observer.views, some):
+        part = replace(observer, view_angles=observer.view_angles[a : a + some])
+        across = wall_points(part, t[:, None] + half_pixel * parts)[..., None]
+        u = outgoing_angles(part, across) + incident_angles(strips, card.distance, across)
+        pixel = max(pixel, _PARTS * float(np.abs(np.diff(u, axis=2)).max()))
+        centre = across[:, :, _PARTS // 2]
+        ends = (incident_angles(strips + half_strip * node, card.distance, centre) for node in parts)
+        strip = max(strip, _PARTS * max(float((right - left).max()) for left, right in itertools.pairwise(ends)))
     return pixel, strip
 
 
-def _kernel(
-    observer: Observer,
-    card: Card,
-    weights: Weights,
-    half_pixel: float,
-    half_strip: float,
-    along_pixel: int,
-    along_strip: int,
-) -> Kernel:
-    """Nodes q = (across the pixel, across the strip); the height of the pixel is summed into the weight."""
-    pixel_nodes, pixel_weights = np.polynomial.legendre.leggauss(along_pixel)
-    strip_nodes, strip_weights = np.polynomial.legendre.leggauss(along_strip)
-    t = pixel_tangents(observer)[:, None] + half_pixel * pixel_nodes
-    # Axes: (A, N, M, pixel node, strip node).
-    wall_x = wall_points(observer, t)[:, :, None, :, None]
-    source_x = np.asarray(card.elements_x)[:, None, None] + half_strip * strip_nodes
-    theta_s = incident_angles(source_x, card.distance, wall_x)
-    theta_o = outgoing_angles(observer, wall_x)
-    average = 0.5 * pixel_weights[:, None] * (0.5 * strip_weights)
-    if weights == "thesis":
-        weight = np.broadcast_to(average, theta_s.shape)
-    elif weights == "cosine":
-        weight = average * np.cos(theta_s)
-    elif card.is_points:
-        weight = average * np.cos(theta_s) ** 4 / card.distance**2
-    else:
-        view = np.asarray(observer.view_angles)[:, None, None]
+@dataclass(frozen=True)
+class _Nodes:
+    """The quadrature nodes of a scene: q = (across the pixel, across the strip), the pixel's height in the weight.
+
+    Parameters
+    ----------
+    half_pixel, half_strip:
+        Half widths of pixel (in tangents) and strip (in metres); 0 where the weights take points.
+    """
+
+    observer: Observer
+    card: Card
+    weights: Weights
+    half_pixel: float
+    half_strip: float
+
+    @classmethod
+    def of(cls, observer: Observer, card: Card, weights: Weights) -> _Nodes:
+        if weights not in get_args(Weights):
+            raise InputError(f'is "{weights}"; choose one of {", ".join(get_args(Weights))}', field="transport")
+        points = weights != "physical"
+        half_pixel = 0.0 if points else pixel_half_width(observer)
+        return cls(observer, card, weights, half_pixel, 0.0 if points else card.element_width / 2)
+
+    def orders(self, resolution: float, tolerance: float) -> tuple[int, int]:
+        """The orders across pixel and strip that resolve lobes of this width in radians."""
+        pixel_turn, strip_turn = _extent_in_angle(self.observer, self.card, self.half_pixel, self.half_strip)
+        # The weight in front of the BRDF varies over angles as well, about as a lobe of this width does.
+        scale = 1 / math.hypot(1 / resolution, 1 / _WEIGHT_SCALE)
+        return quadrature_order(pixel_turn / scale, tolerance), quadrature_order(strip_turn / scale, tolerance)
+
+    def checked(self, orders: tuple[int, int]) -> tuple[int, int]:
+        """Orders that somebody asked for, 1 where there is nothing to integrate over."""
+        if not all(1 <= order <= _MAX_ORDER for order in orders):
+            raise InputError(f"are {orders}; give 1 to {_MAX_ORDER} nodes across pixel and strip", field="orders")
+        return orders[0] if self.half_pixel > 0 else 1, orders[1] if self.half_strip > 0 else 1
+
+    def transport(self, orders: tuple[int, int], brdf: BRDF) -> Array:
+        """F, node by node, over blocks of pixels that stay in a processor's cache."""
+        views, pixels, elements = self.observer.views, self.observer.pixels, self.card.elements
+        block = max(1, _BLOCK // elements)
+        some_views, some_pixels = max(1, block // pixels), min(block, pixels)
+        of_pixel, of_strip, average = self._rule(orders)
+        transport = np.empty((views, pixels, elements))
+        source_x = np.asarray(self.card.elements_x)[:, None, None, None] + of_strip  # axes: (M, A, N), node
+        for a, j in itertools.product(range(0, views, some_views), range(0, pixels, some_pixels)):
+            part = slice(a, a + some_views), slice(j, j + some_pixels)
+            observer = replace(self.observer, view_angles=self.observer.view_angles[part[0]])
+            t = pixel_tangents(observer)[part[1]]
+            sums = np.zeros((elements, observer.views, t.size))
+            for p, across in enumerate(of_pixel):
+                seen = self._seen(observer, t + across)
+                for s in range(of_strip.size):
+                    theta_s, theta_o, weight = self._transported(*seen, source_x[..., s])
+                    rho = brdf.of_sum(theta_s + theta_o) if isinstance(brdf, AngleSumBRDF) else brdf(theta_s, theta_o)
+                    if weight is not None:
+                        rho *= weight
+                    rho *= average[p, s]
+                    sums += rho
+            transport[part] = np.moveaxis(sums, 0, -1)
+        return transport
+
+    def kernel(self, orders: tuple[int, int]) -> Kernel:
+        """All nodes of all pixels at once, in the order of `Kernel`."""
+        of_pixel, of_strip, average = self._rule(orders)
+        # Axes: (A, N, M, pixel node, strip node).
+        wall_x, theta_o, reach = (
+            x[:, :, None, :, None] for x in self._seen(self.observer, pixel_tangents(self.observer)[:, None] + of_pixel)
+        )
+        source_x = np.asarray(self.card.elements_x)[:, None, None] + of_strip
+        theta_s, theta_o, weight = self._transported(wall_x, theta_o, reach, source_x)
+        weight = np.broadcast_to(average, theta_s.shape) if weight is None else np.multiply(weight, average, out=weight)
+        shape = (*theta_s.shape[:3], -1)
+        theta_o = np.broadcast_to(theta_o, theta_s.shape)
+        return Kernel(theta_s.reshape(shape), theta_o.reshape(shape), np.ascontiguousarray(weight).reshape(shape))
+
+    def _rule(self, orders: tuple[int, int]) -> tuple[Array, Array, Array]:
+        """Offsets of the nodes across pixel (in tangents) and strip (in metres), and their weights, which sum to 1."""
+        pixel_nodes, pixel_weights = np.polynomial.legendre.leggauss(orders[0])
+        strip_nodes, strip_weights = np.polynomial.legendre.leggauss(orders[1])
+        average = 0.5 * pixel_weights[:, None] * (0.5 * strip_weights)
+        return self.half_pixel * pixel_nodes, self.half_strip * strip_nodes, average
+
+    def _seen(self, observer: Observer, t: Array) -> tuple[Array, Array, Array]:
+        """Wall point, theta_o, and how far up the wall a pixel reaches, at image positions t, each (A, *t.shape)."""
+        wall_x = wall_points(observer, t)
+        view = np.asarray(observer.view_angles).reshape((-1,) + (1,) * t.ndim)
         path = observer.distance / (np.cos(view) + t * np.sin(view))
-        reach = (half_pixel * path)[:, :, None, :, None]  # how far up the wall the pixel sees
-        weight = _mean_strip_factor(card.distance, source_x - wall_x, card.element_height / 2, reach)
-        weight *= average * card.element_width
-    shape = (*theta_s.shape[:3], -1)
-    theta_o = np.broadcast_to(theta_o, theta_s.shape)
-    return Kernel(theta_s.reshape(shape), theta_o.reshape(shape), np.ascontiguousarray(weight).reshape(shape))
+        return wall_x, outgoing_angles(observer, wall_x), self.half_pixel * path
+
+    def _transported(
+        self, wall_x: Array, theta_o: Array, reach: Array, source_x: Array
+    ) -> tuple[Array, Array, Array | None]:
+        """theta_s, theta_o and the weight at the nodes; None for a weight of 1."""
+        card = self.card
+        if self.weights != "physical" or card.is_points:
+            theta_s = incident_angles(source_x, card.distance, wall_x)
+            match self.weights:
+                case "thesis":
+                    return theta_s, theta_o, None
+                case "cosine":
+                    return theta_s, theta_o, np.cos(theta_s)
+                case _:
+                    return theta_s, theta_o, np.cos(theta_s) ** 4 / card.distance**2
+        slope = (source_x - wall_x) / card.distance
+        weight = _mean_strip_factor(
+            card.distance, slope, card.element_height / 2, reach if self.half_pixel > 0 else None
+        )
+        weight *= card.element_width
+        return np.arctan(slope), theta_o, weight
 
 
-def _mean_strip_factor(distance: float, dx: Array, half: float, reach: Array) -> Array:
+def _mean_strip_factor(distance: float, slope: Array, half: float, reach: Array | None) -> Array:
     """Mean of `strip_factor` over wall points from -reach to reach below a strip from -half to half, in 1/m.
 
     With G(h) = z^2 h atan(h / a) / (2 a^3), whose derivative is the antiderivative of `strip_factor`, the mean is
     [G(half + reach) - G(half - reach)] / reach; sum and difference of the arctangents are taken as one each, since both
     may cancel.
+
+    Parameters
+    ----------
+    slope:
+        tan theta_s = dx / z, so that a^2 = z^2 (1 + slope^2).
+    reach:
+        None for points.
     """
-    a = np.hypot(distance, dx)
-    upper, lower = (half + reach) / a, (half - reach) / a
-    both = np.arctan2(2 * half / a, 1 - upper * lower)
-    with np.errstate(invalid="ignore"):
-        apart = np.arctan2(2 * reach / a, 1 + upper * lower) / np.where(reach > 0, reach, 1.0)
-    apart = np.where(reach > 0, apart, 2 * a / (a * a + half * half))
-    mean: Array = 0.5 * (distance / a) ** 2 / a * (half * apart + both)
+    with np.errstate(over="ignore", divide="ignore"):  # beyond 1e154 z nothing arrives
+        square = slope * slope
+        square += 1.0
+        inverse = np.sqrt(square)  # 1 / a
+        inverse *= distance
+        np.divide(1.0, inverse, out=inverse)
+        if reach is None:
+            h = half * inverse
+            mean = 1 / (h + 1 / h)  # h / (1 + h^2), whose square may overflow
+            mean += np.arctan(h, out=h)
+            mean *= 2
+        else:
+            product, both = (half + reach) * inverse, (half - reach) * inverse
+            product *= both
+            mean = 1 + product
+            np.arctan2(np.multiply(2 * reach, inverse, out=both), mean, out=mean)
+            mean *= half / reach
+            np.subtract(1, product, out=product)
+            np.arctan2(np.multiply(2 * half, inverse, out=both), product, out=both)
+            mean += both
+    mean *= 0.5
+    mean *= inverse
+    mean /= square
     return mean

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from wallmirror.brdf import Diffuse, GaussianTrain
 from wallmirror.geometry import Card, Observer, pixel_half_width
-from wallmirror.transport import _kernel, build_kernel
+from wallmirror.transport import _Nodes, build_kernel
 
 from .helpers import same_examples
 
@@ -32,7 +32,7 @@ def strip_error(order: int, width: float, distance: float) -> float:
     height = 0.3
     card = Card(elements_x=(0.0,), y=-distance, element_width=width, element_height=height)
     # Along a pixel of no width only the strip is integrated.
-    measured = _kernel(AHEAD, card, "physical", 0.0, width / 2, 1, order).apply(WHITE)[0, 0, 0]
+    measured = _Nodes(AHEAD, card, "physical", 0.0, width / 2).kernel((1, order)).apply(WHITE)[0, 0, 0]
     p, q = width / 2 / distance, height / 2 / distance
     exact = (2 / math.pi) * (
         p / math.hypot(1, p) * math.atan(q / math.hypot(1, p)) + q / math.hypot(1, q) * math.atan(p / math.hypot(1, q))
@@ -43,7 +43,7 @@ def strip_error(order: int, width: float, distance: float) -> float:
 def footprint_error(order: int, half: float, distance: float) -> float:
     """Relative error of the mean of cos^4 / z^2, a point above the middle of a pixel, over the pixel's width."""
     card = Card(elements_x=(0.0,), y=-distance)
-    measured = _kernel(AHEAD, card, "physical", half, 0.0, order, 1).apply(WHITE)[0, 0, 0]
+    measured = _Nodes(AHEAD, card, "physical", half, 0.0).kernel((order, 1)).apply(WHITE)[0, 0, 0]
     w = 5.0 * half / distance
     exact = (w / (1 + w * w) + math.atan(w)) / (2 * math.pi * w) / distance**2
     return abs(float(measured) / exact - 1)
@@ -232,7 +232,7 @@ def test_a_tolerance_asked_of_a_midpoint_rule_is_not_kept(monkeypatch: pytest.Mo
     monkeypatch.setattr(np.polynomial.legendre, "leggauss", midpoint)
     half = pixel_half_width(observer)
     # As many nodes along the strip as the kernel has in both directions together.
-    even = _kernel(observer, card, "physical", half, card.element_width / 2, nodes, nodes)
+    even = _Nodes(observer, card, "physical", half, card.element_width / 2).kernel((nodes, nodes))
     assert abs(float(even.apply(brdf)[0, 5, 0]) - exact) > 2e-6 * brightest
-    fewer = _kernel(observer, card, "physical", half, card.element_width / 2, 4, nodes // 4)
+    fewer = _Nodes(observer, card, "physical", half, card.element_width / 2).kernel((4, nodes // 4))
     assert abs(float(fewer.apply(brdf)[0, 5, 0]) - exact) > 10 * 2e-6 * brightest

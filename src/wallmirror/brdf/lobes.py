@@ -13,6 +13,9 @@ from scipy.special import betainc
 from wallmirror.brdf.base import BRDF, AngleSumBRDF, Array, LobeForm, require_choice, require_range
 from wallmirror.errors import InputError
 
+_FAR = -703.0  # the exponent from which on a Gaussian is taken for 0
+_NOTHING = float(np.exp(_FAR))
+
 #: What the height of a lobe means: 1 at its peak (the thesis's code) or unit integral per degree or radian (its text).
 LobeHeight = Literal["peak", "per_degree", "per_radian"]
 
@@ -215,12 +218,22 @@ class GaussianTrain(AngleSumBRDF):
     def of_sum(self, u: ArrayLike) -> Array:
         """Value in 1/sr at angle sums u in radians, same shape."""
         u = np.asarray(u, dtype=np.float64)
-        # exp(-z^2/2) directly: dividing a density by its peak turns into 0/0 for tiny sigma. exp(-40^2/2) is 0, and z
-        # beyond it may overflow.
-        total = np.zeros(u.shape)
+        angle = np.atleast_1d(u)
+        # exp(-z^2/2) directly: dividing a density by its peak turns into 0/0 for tiny sigma. Where it falls below 1e-305 it
+        # is 0, since an exp that underflows takes eight times as long.
+        total = np.zeros(angle.shape)
         for centre in self.centres:
-            total += np.exp(-0.5 * (np.minimum(np.abs(u - centre), 40 * self.sigma) / self.sigma) ** 2)
-        return self._peak() * total
+            z = angle - centre
+            with np.errstate(over="ignore"):
+                z /= self.sigma
+                z *= z
+            z *= -0.5
+            np.maximum(z, _FAR, out=z)
+            np.exp(z, out=z)
+            z -= _NOTHING
+            total += z
+        total *= self._peak()
+        return total.reshape(u.shape)
 
     def _peak(self) -> float:
         if self.height == "peak":

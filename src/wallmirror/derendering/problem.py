@@ -15,6 +15,7 @@ from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, noise_edge, signal_space, space_within
 from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card
+from wallmirror.memory import film_bytes, require_memory
 from wallmirror.transport import build_kernel
 
 Array = NDArray[np.float64]
@@ -116,8 +117,14 @@ def prepare(
     ------
     UndeterminedError
         When no solver could succeed: coincident elements, too few or too similar patterns, darkness, saturation.
+    InputError
+        If the memory does not hold the captures and what is made of them.
     """
     views, pixels, realisations = captures.radiance.shape
+    require_memory(
+        film_bytes(views, pixels, realisations),
+        f"a solution from {views} views x {pixels} pixels x {realisations} realisations",
+    )
     elements = captures.card.elements
     if len(set(captures.card.elements_x)) < elements:
         raise UndeterminedError(

@@ -15,6 +15,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize_scalar
 
+from wallmirror.memory import design_bytes, require_memory
 from wallmirror.transport import Kernel
 
 Array = NDArray[np.float64]
@@ -126,8 +127,12 @@ def grid_for(kernel: Kernel, *, step: float, degree: int) -> SplineGrid:
 
 
 def design_matrices(kernel: Kernel, grid: SplineGrid) -> list[sp.csr_array]:
-    """T_1 .. T_M, each sparse (P, K) with P = A N, such that F[:, i] = T_i r."""
+    """T_1 .. T_M, each sparse (P, K) with P = A N, such that F[:, i] = T_i r; InputError if memory does not hold them."""
     views, pixels, elements, nodes = kernel.weight.shape
+    require_memory(
+        design_bytes(views, pixels, elements, nodes, degree=grid.degree, knots=grid.size),
+        f"the solver's {grid.size} knots at {views} views x {pixels} pixels x {elements} elements x {nodes} nodes",
+    )
     rows = views * pixels
     first, values = grid.basis(kernel.angle_sum)
     order = grid.degree + 1

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet
+from wallmirror.memory import film_bytes, require_memory, transport_bytes
 from wallmirror.pathtracing.cameras import Sampler
 from wallmirror.pathtracing.rendering import Renderer, spread_seeds
 from wallmirror.scene import Scene
@@ -50,13 +51,22 @@ def render_captures(
     -------
     Radiance and variance, both (A, N, B), with the geometry; the variance is that of `Render.moment_variance` for
     independent samples.
+
+    Raises
+    ------
+    InputError
+        If the scene cannot be rendered, or the memory does not hold the captures.
     """
+    views, pixels, realisations = scene.observer.views, scene.observer.pixels, scene.source.shape[1]
+    require_memory(
+        film_bytes(views, pixels, realisations),
+        f"a capture set of {views} views x {pixels} pixels x {realisations} realisations",
+    )
     renderer = Renderer(scene, variant=variant)
     settings = scene.render
     spp = settings.spp if spp is None else spp
     max_depth = settings.max_depth if max_depth is None else max_depth
     rr_depth = settings.rr_depth if rr_depth is None else rr_depth
-    views, pixels, realisations = scene.observer.views, scene.observer.pixels, scene.source.shape[1]
     radiance, variance = np.empty((2, views, pixels, realisations))
     roots = spread_seeds(seed, views * realisations * seeds)
     for done in range(views * realisations):
@@ -117,6 +127,10 @@ def render_one_hot(
     The M columns of one view share their random numbers, so that any mixture of them is, up to rounding, what
     rendering the mixture with the same seed would give. Parameters are those of `render_captures`.
     """
+    require_memory(
+        transport_bytes(scene.observer.views, scene.observer.pixels, scene.card.elements),
+        f"F of {scene.observer.views} views x {scene.observer.pixels} pixels x {scene.card.elements} elements",
+    )
     renderer = Renderer(scene, variant=variant)
     views, pixels, elements = scene.observer.views, scene.observer.pixels, scene.card.elements
     transport = np.empty((views, pixels, elements))

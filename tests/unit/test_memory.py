@@ -1,0 +1,167 @@
+"""The estimates of memory against measured peaks, and refusals that come before any allocation."""
+
+from __future__ import annotations
+
+import dataclasses
+import tracemalloc
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from wallmirror import memory
+from wallmirror.brdf import Mirror
+from wallmirror.captures import CaptureSet
+from wallmirror.derendering import problem, splines
+from wallmirror.derendering.problem import prepare
+from wallmirror.derendering.solve import solve
+from wallmirror.geometry import Observer
+from wallmirror.pathtracing.filming import render_captures, render_one_hot
+from wallmirror.scene import load_scene
+from wallmirror.transport import build_kernel, radiance, transport_matrix
+
+from .helpers import lobes, refused, thesis_card, thesis_observer
+
+LOBES = lobes()
+WIDE = thesis_observer(2000, 10, "centres")
+
+
+def peak(work: Callable[[], object]) -> int:
+    """Bytes that NumPy and Python held at most during a call, beyond those before it."""
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def films(observer: Observer, realisations: int, noise: float = 0.0) -> CaptureSet:
+    card = thesis_card()
+    source = np.random.default_rng(0).random((card.elements, realisations))
+    clean = radiance(transport_matrix(observer, card, LOBES, weights="cosine"), source)
+    noisy = clean + noise * np.random.default_rng(1).standard_normal(clean.shape)
+    variance = np.full(clean.shape, noise**2) if noise else None
+    return CaptureSet(observer=observer, card=card, transport="cosine", radiance=noisy, variance=variance)
+
+
+# -- estimates ----------------------------------------------------------------------------------------------------
+
+# An estimate below the peak would let a process be killed; one several times above it would refuse what fits. Which of
+# the temporary arrays live together depends on NumPy, so a factor of two of room is left above.
+ROOM = 2.0
+
+
+@pytest.mark.parametrize("orders", [(2, 3), (4, 6)])
+def test_a_kernel_takes_what_is_foretold(orders: tuple[int, int]) -> None:
+    card = thesis_card(width=0.02)
+    foretold = memory.kernel_bytes(10, 2000, card.elements, orders[0] * orders[1])
+    used = peak(lambda: build_kernel(WIDE, card, orders=orders).apply(LOBES))
+    assert used <= foretold <= ROOM * used
+
+
+def test_a_transport_matrix_takes_what_is_foretold_whatever_its_quadrature() -> None:
+    card = thesis_card(elements=16, width=0.02)
+    foretold = memory.transport_bytes(10, 2000, 16)
+    for tolerance in (1e-3, 1e-9):
+        used = peak(lambda tolerance=tolerance: transport_matrix(WIDE, card, LOBES, tolerance=tolerance))
+        assert used <= foretold <= ROOM * used
+
+
+def test_preparing_captures_takes_what_is_foretold() -> None:
+    captures = films(thesis_observer(500, 20), 60, noise=0.01)
+    foretold = memory.film_bytes(20, 500, 60)
+    used = peak(lambda: prepare(captures))
+    assert used <= foretold <= ROOM * used
+
+
+@pytest.mark.parametrize("step_deg", [0.25, 1.0])
+def test_design_matrices_take_what_is_foretold(step_deg: float) -> None:
+    card = thesis_card(width=0.02)
+    kernel = build_kernel(WIDE, card, orders=(2, 4))
+    grid = splines.grid_for(kernel, step=np.radians(step_deg), degree=3)
+    foretold = memory.design_bytes(*kernel.weight.shape, degree=3, knots=0)  # the fit comes later
+    used = peak(lambda: splines.design_matrices(kernel, grid))
+    assert used <= foretold <= ROOM * used
+
+
+def test_a_whole_solution_stays_within_its_largest_estimate() -> None:
+    captures = films(thesis_observer(500, 20), 20, noise=0.01)
+    knots = 1000  # at 0.25 deg the thesis's angle sums fill 220 deg
+    foretold = memory.design_bytes(20, 500, 4, 1, degree=3, knots=knots) + memory.film_bytes(20, 500, 20)
+    assert peak(lambda: solve(captures, step_deg=0.25)) <= foretold
+
+
+# -- refusals -----------------------------------------------------------------------------------------------------
+
+
+def too_large(monkeypatch: pytest.MonkeyPatch, gigabytes: str = "0.002") -> None:
+    monkeypatch.setenv(memory.LIMIT_VARIABLE, gigabytes)
+
+
+REFUSED: dict[str, Callable[[], object]] = {
+    "kernel": lambda: build_kernel(WIDE, thesis_card(width=0.02), orders=(4, 4)),
+    "transport": lambda: transport_matrix(WIDE, thesis_card(elements=64), LOBES, weights="cosine"),
+    "mirror": lambda: transport_matrix(WIDE, thesis_card(elements=64, width=0.02), Mirror()),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_does_not_fit_is_refused_before_it_is_allocated(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    too_large(monkeypatch)
+    used = peak(lambda: refused(REFUSED[name]))
+    # The quadrature rules, positions of the pixels and the error itself, far below the 20 MB of the first array.
+    assert used < 2e6
+    message = str(refused(REFUSED[name]))
+    assert message.startswith("memory: ")
+    assert "0.002 GB are left" in message
+    assert memory.LIMIT_VARIABLE in message
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_without_the_guard_the_same_call_takes_more_than_the_limit(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The twin: the calls above are refused for a reason.
+    too_large(monkeypatch)
+    monkeypatch.setattr("wallmirror.transport.require_memory", lambda needed, what: None)
+    assert peak(REFUSED[name]) > 0.002e9
+
+
+def test_captures_too_large_to_solve_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    captures = films(thesis_observer(500, 4), 20)
+    too_large(monkeypatch, "0.001")
+    assert "2000" not in str(refused(lambda: prepare(captures)))
+    assert "a solution from 4 views x 500 pixels x 20 realisations needs 0.00192 GB" in str(
+        refused(lambda: prepare(captures))
+    )
+    monkeypatch.setattr(problem, "require_memory", lambda needed, what: None)
+    prepare(captures)  # the twin
+
+
+def test_too_many_knots_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel = build_kernel(thesis_observer(50, 2), thesis_card(), weights="cosine")
+    grid = splines.grid_for(kernel, step=np.radians(0.01), degree=3)
+    too_large(monkeypatch, "0.1")
+    assert f"{grid.size} knots" in str(refused(lambda: splines.design_matrices(kernel, grid)))
+
+
+def test_a_capture_set_too_large_is_refused_before_a_path_tracer_is_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = load_scene("flat_wall_lobes")
+    large = dataclasses.replace(scene, observer=dataclasses.replace(scene.observer, pixels=1_000_000))
+    too_large(monkeypatch, "1")
+    monkeypatch.setattr("wallmirror.pathtracing.filming.Renderer", None)  # would raise TypeError
+    assert "20 views x 1000000 pixels x 4 realisations needs 3.84 GB" in str(refused(lambda: render_captures(large)))
+    assert "needs 1.28 GB" in str(refused(lambda: render_one_hot(large)))
+
+
+@pytest.mark.parametrize("value", ["none", "-1", "nan", "0", ""])
+def test_a_limit_that_is_none_is_refused(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    too_large(monkeypatch, value)
+    assert refused(memory.memory_limit).field == memory.LIMIT_VARIABLE
+
+
+def test_the_limit_is_what_the_system_has_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(memory.LIMIT_VARIABLE, raising=False)
+    # Between 10 MB and 100 TB on any machine that runs this test.
+    assert 1e7 < memory.memory_limit() < 1e14
+    memory.require_memory(1e5, "hardly anything")
+    assert "1e+09 GB" in str(refused(lambda: memory.require_memory(1e18, "everything")))
