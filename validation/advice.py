@@ -56,7 +56,7 @@ from wallmirror.jobs.bouncing import DEEP, RR_DEPTH
 from wallmirror.jobs.capturing import film_as_planned
 from wallmirror.jobs.validating import validate_scene
 from wallmirror.pathtracing.building import wall_as_rendered
-from wallmirror.pathtracing.rendering import Renderer, spread_seeds
+from wallmirror.pathtracing.rendering import FILM_ROUNDING, Renderer, spread_seeds
 from wallmirror.report.style import CYCLE, FAINT, INK, clean, new_figure
 from wallmirror.transport import build_kernel
 
@@ -68,6 +68,8 @@ LIMIT = 40_000_000
 #: Seeds of 1024 samples of each half of a reference, of one bounce and of all.
 REFERENCE_SEEDS = (16, 8)
 WITHIN, KEPT = 2.0, 0.95
+#: A gain error below which a comparison has no scatter, as before a mirror.
+EXACT = 1.1e-5
 #: Root seeds of plan, film, reference and validation: never shared.
 PLAN_SEED, FILM_SEED, REFERENCE_SEED, VALIDATE_SEED = 11, 22_000, 33_000, 44_000
 
@@ -307,17 +309,22 @@ def judge(document: dict) -> dict:
         return Tally(sum(abs(math.log(ratio(row))) <= math.log(WITHIN) for row in rows), len(rows))
 
     limits = [row for row in walls if row["limit"]]
-    resolved = [row for row in walls if not row["limit"] and max(row["measured"], row["predicted"]) > row["blur"]]
+    # What no reference can tell: its noise, and the rounding of its film.
+    foretells = [row for row in walls if not row["limit"] and row["predicted"] > 0]
+    floored = [{**row, "blur": max(row["blur"], FILM_ROUNDING)} for row in foretells]
+    resolved = [row for row in floored if max(row["measured"], row["predicted"]) > row["blur"]]
     unblurred = [{**row, "measured": max(row["measured"], row["blur"])} for row in resolved]
     return {
         "kept": Tally(len(kept), len(pairs)),
         "films": foretold(films),
         "walls": foretold(unblurred),
         "wall_kept": Tally(sum(w["measured"] <= t for w, t in walls_with_tolerance(document)), len(walls)),
+        "exact": max((row["measured"] for row in walls if row["predicted"] == 0), default=0.0),
         "limits": Tally(sum(row["measured"] <= max(row["predicted"], row["blur"]) for row in limits), len(limits)),
-        "solved": foretold(solved),
+        "solved": foretold([{**row, "measured": row["bars"]} for row in solved]),
+        "solved_rms": math.sqrt(sum(1 / ratio(row) ** 2 for row in solved) / max(1, len(solved))),
         "validated": Tally(sum(r["validate"]["measured"] <= r["tolerance"] for r in validated), len(validated)),
-        "gains": foretold([r["validate"] for r in validated if r["validate"]["measured"] > 1.1e-5]),
+        "gains": foretold([r["validate"] for r in validated if r["validate"]["measured"] > EXACT]),
         "film_ratios": (min(map(ratio, films)), max(map(ratio, films))),
         "skipped": sum("skipped" in row for row in document["pairs"]),
         "slowest": max(document.get("timings", [{"cpu": math.nan}]), key=lambda row: row["cpu"]),
@@ -339,7 +346,7 @@ def reached(found: dict) -> bool:
     shares = [found[name].share for name in ("kept", "films", "walls", "validated")]
     if found["limits"].of:
         shares.append(found["limits"].share)
-    return found["kept"].of >= 60 and min(shares) >= KEPT and found["slowest"]["cpu"] <= 20.0
+    return found["kept"].of >= 60 and min(shares) >= KEPT and found["slowest"]["cpu"] <= 10.0
 
 
 def page(document: dict) -> str:
@@ -367,10 +374,15 @@ def page(document: dict) -> str:
         f"| the wall by the planned analytic route, where one is | {found['wall_kept']} | {found['walls']} |",
         f"| the smallest gain error that the planned validation sees (`validate --tolerance`) | {found['validated']} | "
         f"{found['gains']} |",
-        f"| the pattern's error from the planned films, from the Cramer-Rao bound (one bounce) | - | {found['solved']} |",
+        "| the pattern's error from the planned films, from the Cramer-Rao bound, against the error bars that `solve` then "
+        f"finds (one bounce) | - | {found['solved']} |",
         "",
         "A wall's error below what the reference's noise could feign is judged against that. Where the pilot's own noise "
-        f"hid what the card's glow leaves out, the plan states a limit, which held in {found['limits']}. "
+        f"hid what the card's glow leaves out, the plan states a limit, which held in {found['limits']}. A mirror before a "
+        f"black card is computed exactly; the {100 * found['exact']:.2g} % measured there are the path tracer's own, which "
+        "displaces rays at the strips' borders, and have no ratio. "
+        f"The true errors of the patterns are {found['solved_rms']:.2f} times the foretold in the rms over all pairs; one by "
+        "one they scatter, as errors of sixteen numbers do. "
         f"{found['skipped']} pairs need more than {LIMIT:.0e} samples: their films were planned but not made, and only "
         "the wall is judged.",
         "",
@@ -409,11 +421,11 @@ def timing_lines(document: dict) -> list[str]:
     rows = document.get("timings", [])
     if not rows:
         return []
-    cpu = sorted(row["cpu"] for row in rows)
+    cpu, wall = (sorted(row[k] for row in rows) for k in ("cpu", "wall"))
     return [
-        f"Advice on the {len(rows)} shipped scenes as they are takes {cpu[0]:.1f} to {cpu[-1]:.1f} s of processor time "
-        f"(median {cpu[len(cpu) // 2]:.1f} s), compiling included; on two cores nearly half of that passes, as most of it "
-        "is rendering.",
+        f"Advice on the {len(rows)} shipped scenes as they are (500 pixels, 20 views, 4 patterns) takes {cpu[0]:.1f} to "
+        f"{cpu[-1]:.1f} s of processor time (median {cpu[len(cpu) // 2]:.1f} s) and {wall[0]:.1f} to {wall[-1]:.1f} s by the "
+        "clock of a machine of two cores that others used as well.",
         "",
     ]
 
@@ -437,34 +449,42 @@ def figure(document: dict) -> bytes:
         "solve": "recovered pattern",
     }
     for axes, (name, title) in zip(chart.subplots(1, 4), titles.items(), strict=True):
-        rows = [(r[name], r["tolerance"]) for r in document["pairs"] if "measured" in r.get(name, {})]
+        # What is exact (a mirror) has no place on such a scale.
+        rows = [
+            (r[name], r["tolerance"])
+            for r in document["pairs"]
+            if r.get(name, {}).get("measured", 0.0) > EXACT and r[name]["predicted"] > 0
+        ]
         axes.set_title(title)
         if not rows:
             continue
-        x = np.array([max(row["measured"], row.get("blur", 0.0), 1e-7) for row, _ in rows])
-        y = np.array([max(row["predicted"], 1e-7) for row, _ in rows])
+        x = np.array([max(row["measured"], row.get("blur", 0.0)) for row, _ in rows])
+        y = np.array([row["predicted"] for row, _ in rows])
         ends = np.array([min(x.min(), y.min()) / 2, max(x.max(), y.max()) * 2])
         axes.fill_between(ends, ends / WITHIN, ends * WITHIN, color=FAINT, alpha=0.2, linewidth=0)
         axes.plot(ends, ends, color=INK, linewidth=0.8)
         blurred = np.array([row["measured"] <= row.get("blur", 0.0) for row, _ in rows])
+        limit = np.array([row.get("limit", False) for row, _ in rows])
         for tolerance, colour in zip(TOLERANCES, CYCLE, strict=False):
             mine = np.array([t == tolerance for _, t in rows])
-            axes.plot(
-                x[mine & ~blurred],
-                y[mine & ~blurred],
-                "o",
-                color=colour,
-                markersize=4,
-                label=f"to {100 * tolerance:g} %",
-            )
-            axes.plot(x[mine & blurred], y[mine & blurred], "o", color=colour, markersize=4, fillstyle="none")
+            for hollow in (False, True):
+                for shape, kind in (("o", ~limit), ("v", limit)):
+                    some = mine & kind & (blurred == hollow)
+                    label = f"to {100 * tolerance:g} %" if shape == "o" and not hollow else None
+                    style = "none" if hollow else "full"
+                    axes.plot(x[some], y[some], shape, color=colour, markersize=4.5, fillstyle=style, label=label)
         axes.set(xscale="log", yscale="log", xlim=ends, ylim=ends, xlabel="measured")
         axes.set_aspect("equal")
         clean(axes)
     chart.axes[0].set_ylabel("predicted relative error")
     chart.axes[0].legend(fontsize=8, frameon=False, loc="lower right")
     chart.axes[1].text(
-        0.98, 0.04, "hollow: measured is\nbelow this noise", transform=chart.axes[1].transAxes, ha="right", fontsize=8
+        0.98,
+        0.04,
+        "hollow: measured is below\nthis noise; triangle: only\na limit was foretold",
+        transform=chart.axes[1].transAxes,
+        ha="right",
+        fontsize=8,
     )
     image = io.BytesIO()
     FigureCanvasAgg(chart).print_png(image)

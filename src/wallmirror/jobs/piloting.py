@@ -10,15 +10,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wallmirror.brdf import AngleSumBRDF
+from wallmirror.brdf import BRDF, AngleSumBRDF, Mirror
 from wallmirror.comparison import detectable_gain
+from wallmirror.geometry import Card, Observer
 from wallmirror.interreflection import from_card
 from wallmirror.jobs.bouncing import DEEP, RR_DEPTH, spread
-from wallmirror.jobs.validating import SEEDS, expect, render_seeds
+from wallmirror.jobs.validating import SEEDS, Transport, expect, render_seeds
 from wallmirror.pathtracing.filming import steadied
 from wallmirror.pathtracing.rendering import Renderer, largest_pass, spread_seeds
 from wallmirror.planning.sampling import MOST_SPP, NoiseLevel, Sampler, Sampling
 from wallmirror.scene import Scene
+from wallmirror.transport import Kernel, build_kernel, mirror_matrix
 
 Array = NDArray[np.float64]
 
@@ -272,7 +274,7 @@ def pilot_gain(scene: Scene, *, seed: int) -> tuple[GainLevel, ...]:
         sample = render_seeds(scene, views=_GAIN_VIEWS, spp=spp, seed=seed, count=_GAIN_SEEDS)
         seconds = (time.perf_counter() - started) / (len(sample.views) * _GAIN_SEEDS)
         if not found:
-            expectation = expect(scene, sample.views)
+            expectation = expect(scene, sample.views, transport=_rough_transport())
         detectable = detectable_gain(
             sample.seeds,
             expectation.reference,
@@ -282,3 +284,18 @@ def pilot_gain(scene: Scene, *, seed: int) -> tuple[GainLevel, ...]:
         )
         found.append(GainLevel(spp, detectable * math.sqrt(len(sample.views)), SEEDS * seconds))
     return tuple(found)
+
+
+def _rough_transport() -> Transport:
+    """F to 1e-4 of a lobe's peak, far below the noise of a pilot's seed, with one kernel for all BRDFs of a scale."""
+    kernels: dict[float, Kernel] = {}
+
+    def transport(observer: Observer, card: Card, brdf: BRDF) -> Array:
+        if isinstance(brdf, Mirror):
+            return mirror_matrix(observer, card, brdf)
+        scale = brdf.angular_scale
+        if scale not in kernels:
+            kernels[scale] = build_kernel(observer, card, resolution=scale, tolerance=1e-4)
+        return kernels[scale].apply(brdf)
+
+    return transport
