@@ -95,11 +95,9 @@ def read_exr_header(path: Path, *, max_samples: int) -> ExrHeader:
     >>> read_exr_header(Path("view00_real00.exr"), max_samples=2**27).columns  # doctest: +SKIP
     500
     """
-    if not path.exists():
-        raise InputError("no such file", file=path)
-    if not path.is_file():
-        raise InputError("is not a file", file=path)
     try:
+        if path.exists() and not path.is_file():  # opening a pipe would wait for ever
+            raise InputError("is not a file", file=path)
         with path.open("rb") as file:
             size = path.stat().st_size
             start = file.read(8)
@@ -107,6 +105,8 @@ def read_exr_header(path: Path, *, max_samples: int) -> ExrHeader:
                 raise InputError("is empty" if not start else "is not an EXR file", file=path)
             header = _Reader(file, path).header(start)
             table_start = file.tell()
+    except FileNotFoundError:
+        raise InputError("no such file", file=path) from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", file=path) from None
     if header.samples > max_samples:

@@ -1,4 +1,4 @@
-"""Writing results so that nothing is lost: to a temporary name in the same folder, then renamed."""
+"""Reading no more than is sensible, and writing so that nothing is lost: to a temporary name, then renamed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 
 from wallmirror.errors import InputError
+from wallmirror.limits import size_text
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
@@ -34,3 +35,19 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         if temporary is not None:
             with contextlib.suppress(OSError):
                 Path(temporary).unlink()
+
+
+def read_bounded(path: Path, most: int) -> bytes:
+    """A file's bytes; InputError if it is absent, cannot be read, or has more than `most`."""
+    try:
+        if path.exists() and not path.is_file():  # a pipe or a device may never end
+            raise InputError("is not a file", file=path)
+        with path.open("rb") as file:
+            content = file.read(most + 1)
+    except FileNotFoundError:
+        raise InputError("no such file", file=path) from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be read ({error})", file=path) from None
+    if len(content) > most:
+        raise InputError(f"is longer than {size_text(most)}, the most that is read", file=path)
+    return content
