@@ -2,8 +2,8 @@
 
 OpenEXR itself notices little: it reads most byte-flipped files without a word, prints its complaint about a file
 cut short on stdout or stderr and returns nothing, and reports no error when the disk is full. Hence the checksums,
-verified on reading wherever the attribute is present, the header that `exr_header` judges before OpenEXR sees it, and
-the reading back of every file before it gets its name.
+verified on reading wherever the attribute is present, the header and table that are judged before OpenEXR sees them,
+and the reading back of every file before it gets its name.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import OpenEXR
 from numpy.typing import ArrayLike, NDArray
 
 from wallmirror.errors import InputError
+from wallmirror.exr_chunks import require_sound_chunks
 from wallmirror.exr_header import ExrHeader, read_exr_header
 
 Pixels = NDArray[np.float32]
@@ -125,6 +126,7 @@ def read_exr(path: str | Path, *, max_pixels: int = MAX_PIXELS) -> ExrImage:
     """
     path = Path(path)
     header = read_exr_header(path, max_samples=max_pixels)
+    require_sound_chunks(path, header)
     loaded = _load(path)
     if {name: array.shape for name, array in loaded.items()} != dict.fromkeys(
         header.channels, (header.rows, header.columns)

@@ -35,9 +35,8 @@ _MAX_ATTRIBUTES = 4096
 _MAX_CHANNELS = 4096
 _MAX_TILE = 2**24  # pixels
 _MAX_NAME = 255
-# Rows of a chunk by compression (none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB); newer ones have up to 256.
-_CHUNK_ROWS = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)
-_COMPRESSIONS = 14
+# Rows of a chunk by compression: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB, HTJ2K256, HTJ2K32.
+_CHUNK_ROWS = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256, 256, 32)
 # Most bytes of pixels that one byte of the file can stand for: a run of 128 in two bytes; deflate's limit is 1032,
 # and PXR24 drops a quarter of each float before that. The others have no such bound.
 _MOST_PER_BYTE = {0: 1, 1: 64, 2: 1032, 3: 1032, 5: 1376}
@@ -53,22 +52,46 @@ class ExrHeader:
         Size of the data window, both at least 1.
     channels:
         Bytes of a sample by channel name.
+    top:
+        Row number of the data window's first row.
     compression:
         Its number in the file's format.
+    tile:
+        Columns and rows of a tile; None where chunks are rows.
+    is_multipart:
+        Whether the file could hold several images; it holds one.
+    table_at:
+        Where in the file the table of chunks begins.
     attributes:
         (type, value) of each attribute by name, as bytes.
     """
 
     rows: int
     columns: int
+    top: int
     channels: dict[str, int]
     compression: int
+    tile: tuple[int, int] | None
+    is_multipart: bool
+    table_at: int
     attributes: dict[bytes, tuple[bytes, bytes]]
 
     @property
     def samples(self) -> int:
         """rows x columns x channels."""
         return self.rows * self.columns * len(self.channels)
+
+    @property
+    def chunk_rows(self) -> int:
+        """Rows of a chunk that is no tile."""
+        return _CHUNK_ROWS[self.compression]
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks of the image at its full resolution."""
+        if self.tile is None:
+            return -(-self.rows // self.chunk_rows)
+        return -(-self.columns // self.tile[0]) * -(-self.rows // self.tile[1])
 
     @property
     def data_bytes(self) -> int:
@@ -104,7 +127,6 @@ def read_exr_header(path: Path, *, max_samples: int) -> ExrHeader:
             if start[:4] != _MAGIC:
                 raise InputError("is empty" if not start else "is not an EXR file", file=path)
             header = _Reader(file, path).header(start)
-            table_start = file.tell()
     except FileNotFoundError:
         raise InputError("no such file", file=path) from None
     except OSError as error:
@@ -115,20 +137,15 @@ def read_exr_header(path: Path, *, max_samples: int) -> ExrHeader:
             f"{size_text(4 * header.samples)}; at most {max_samples} numbers ({size_text(4 * max_samples)}) are read",
             file=path,
         )
-    _require_long_enough(header, path, size - table_start)
+    _require_long_enough(header, path, size - header.table_at)
     return header
 
 
 def _require_long_enough(header: ExrHeader, path: Path, rest: int) -> None:
     """Refuse a file that cannot hold its pixels, whatever stands in it; `rest` bytes follow the header."""
-    if b"tiles" in header.attributes:
-        chunks = 1
-    else:
-        lines = _CHUNK_ROWS[header.compression] if header.compression < len(_CHUNK_ROWS) else 256
-        chunks = -(-header.rows // lines)
-    # Each chunk has an entry of 8 bytes in the table of offsets, and its place and length before its pixels.
-    most = (rest - 16 * chunks) * _MOST_PER_BYTE.get(header.compression, 2**62)
-    if rest < 16 * chunks or most < header.data_bytes:
+    # Each chunk has an entry of 8 bytes in the table of offsets, and at least 8 for place and length before its pixels.
+    most = (rest - 16 * header.chunks) * _MOST_PER_BYTE.get(header.compression, 2**62)
+    if rest < 16 * header.chunks or most < header.data_bytes:
         raise InputError(
             f"is damaged or cut short: {rest} bytes cannot hold {header.columns} x {header.rows} pixels in "
             f"{len(header.channels)} channels",
@@ -168,10 +185,8 @@ class _Reader:
                 raise self._damaged(f"its attribute {name.decode()} is missing or malformed")
         if tiled != (b"tiles" in attributes):
             raise self._damaged("its attribute tiles is missing or out of place")
-        if tiled:
-            self._check_tiles(*attributes[b"tiles"])
         compression = attributes[b"compression"][1][0]
-        if compression >= _COMPRESSIONS or attributes[b"lineOrder"][1][0] > 2:
+        if compression >= len(_CHUNK_ROWS) or attributes[b"lineOrder"][1][0] > 2:
             raise self._damaged("its compression or order of lines is unknown")
         left, top, right, bottom = struct.unpack("<4i", attributes[b"dataWindow"][1])
         if right < left or bottom < top:
@@ -179,8 +194,12 @@ class _Reader:
         return ExrHeader(
             rows=bottom - top + 1,
             columns=right - left + 1,
+            top=top,
             channels=self._channels(attributes[b"channels"][1]),
             compression=compression,
+            tile=self._tile(*attributes[b"tiles"]) if tiled else None,
+            is_multipart=bool(flags & _PARTS),
+            table_at=self._file.tell(),
             attributes=attributes,
         )
 
@@ -197,7 +216,7 @@ class _Reader:
 
     def _channels(self, value: bytes) -> dict[str, int]:
         found: dict[str, int] = {}
-        at = 0
+        at, last = 0, b""
         while value[at : at + 1] != b"\0":
             end = value.find(b"\0", at, at + _MAX_NAME + 1)
             if end < 0 or end + 17 > len(value) - 1:
@@ -207,8 +226,10 @@ class _Reader:
                 name = value[at:end].decode("utf-8")
             except UnicodeDecodeError:
                 raise self._damaged("a channel's name is no text") from None
-            if not 0 <= kind < len(_SAMPLE_BYTES) or name in found or len(found) == _MAX_CHANNELS:
-                raise self._damaged("its list of channels is malformed, has doubles or is too long")
+            # Sorted, since OpenEXR sorts them and would take one channel's pixels for another's.
+            if not 0 <= kind < len(_SAMPLE_BYTES) or value[at:end] <= last or len(found) == _MAX_CHANNELS:
+                raise self._damaged("its list of channels is malformed, out of order or too long")
+            last = value[at:end]
             if sampling != [1, 1]:
                 raise InputError(
                     "has channels at reduced resolution; give every channel all its pixels", file=self._path
@@ -219,13 +240,14 @@ class _Reader:
             raise self._damaged("its list of channels is empty or ends late")
         return found
 
-    def _check_tiles(self, of: bytes, value: bytes) -> None:
+    def _tile(self, of: bytes, value: bytes) -> tuple[int, int]:
         if (of, len(value)) != (b"tiledesc", 9):
             raise self._damaged("its attribute tiles is malformed")
         width, height, mode = struct.unpack("<IIB", value)
         # OpenEXR allocates a tile, whatever the image needs of it.
         if not 0 < width * height <= _MAX_TILE or mode & 0x0F > 2 or mode >> 4 > 1:
             raise self._damaged(f"its tiles are {width} x {height}")
+        return width, height
 
     def _name(self) -> bytes:
         """A text ended by a zero byte, without it."""
