@@ -134,13 +134,17 @@ class Fields:
         # A backslash or drive letter would mean a folder on one system and a name on another.
         foreign = "\\" in text or bool(PureWindowsPath(text).drive)
         if not text.isprintable() or not 0 < len(text) <= _MAX_PATH or foreign or Path(text).is_absolute():
-            raise self.error(name, f"is {shown(text)}; give the name of a file in the {folder} folder, such as raw/a.exr")
+            raise self.error(
+                name, f"is {shown(text)}; give the name of a file in the {folder} folder, such as raw/a.exr"
+            )
         try:
             leaves = not (directory / text).resolve().is_relative_to(directory.resolve())
         except (OSError, RuntimeError):  # links that go round in circles
             leaves = True
         if leaves:
-            raise self.error(name, f'"{shown(text, quote=False)}" leads out of the {folder} folder; move the file into it')
+            raise self.error(
+                name, f'"{shown(text, quote=False)}" leads out of the {folder} folder; move the file into it'
+            )
         return directory / text
 
     def texts(self) -> dict[str, str]:
