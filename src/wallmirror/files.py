@@ -94,7 +94,8 @@ def read_bounded(path: Path, most: int) -> bytes:
         if path.exists() and not path.is_file():  # a pipe or a device may never end
             raise InputError("is not a file", file=path)
         with path.open("rb") as file:
-            content = file.read(most + 1)
+            # No more than is there is asked for, since that much is allocated.
+            content = file.read(min(most, os.fstat(file.fileno()).st_size) + 1)
     except FileNotFoundError:
         raise InputError("no such file", file=path) from None
     except (OSError, ValueError) as error:
