@@ -352,7 +352,9 @@ def main(arguments: list[str] | None = None) -> None:
         document: dict[str, Any] = {"error": str(error), "exit_code": error.exit_code}
         terminal.document(document)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit) as end:  # Typer turns Ctrl-C into exit code 130 without a word
+        if isinstance(end, SystemExit) and end.code != 130:
+            raise
         Terminal().error("interrupted; earlier results are untouched")
         sys.exit(130)
 
