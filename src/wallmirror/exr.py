@@ -15,6 +15,7 @@ import json
 import os
 import secrets
 import sys
+import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,7 @@ Pixels = NDArray[np.float32]
 MAX_PIXELS = 2**27
 
 _ATTRIBUTE = "wallmirror"
+_SILENCING = threading.Lock()  # the process has one stderr
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +113,7 @@ def write_exr(
 def read_exr(path: str | Path, *, max_pixels: int = MAX_PIXELS) -> ExrImage:
     """Read the float and half channels of an EXR file, verified where it carries checksums.
 
-    Not for several threads at once: what OpenEXR prints is diverted meanwhile.
+    Threads read one after the other, since what OpenEXR prints is diverted meanwhile.
 
     Parameters
     ----------
@@ -166,7 +168,7 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
     """Drop what Python prints and what C code writes to stderr: a refusal is one sentence."""
-    with contextlib.redirect_stdout(io.StringIO()):
+    with _SILENCING, contextlib.redirect_stdout(io.StringIO()):
         try:
             sys.stderr.flush()
             kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)

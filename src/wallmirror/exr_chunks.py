@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from io import RawIOBase
 from pathlib import Path
 
 import numpy as np
@@ -25,23 +27,19 @@ def require_sound_chunks(path: Path, header: ExrHeader) -> None:
     InputError
         At the first chunk that is not where the table says.
     """
-    with path.open("rb") as file:
-        content = np.memmap(file, np.uint8, mode="r")
+    # Without a buffer: leaders lie far apart. Not mapped into memory: a file cut short meanwhile would kill the process.
+    with path.open("rb", buffering=0) as file:
+        file_size = os.fstat(file.fileno()).st_size
         for first in range(0, header.chunks, _AT_ONCE):
             index = np.arange(first, min(first + _AT_ONCE, header.chunks))
-            offsets = _numbers(content, header.table_at + 8 * index, "<i8")
-            words = (1 if header.is_multipart else 0) + (4 if header.tile else 1)
-            leader = 4 * words + 4
-            lowest, highest = header.table_at + 8 * header.chunks, content.size - leader
-            inside = (lowest <= offsets) & (offsets <= highest)
-            places = np.where(inside, offsets, lowest)
-            if lowest > highest:
-                raise InputError("is damaged or cut short: it ends before its pixels", file=path)
+            offsets = np.frombuffer(_read(file, header.table_at + 8 * first, 8 * index.size), "<i8")
             expected = _leaders(header, index)
-            stated = [_numbers(content, places + 4 * k, "<i4") for k in range(words)]
-            good = inside & np.all([s == e for s, e in zip(stated, expected, strict=True)], axis=0)
-            size = _numbers(content, places + 4 * words, "<i4")
-            good &= (size >= 0) & (places + leader + size <= content.size)
+            leader = 4 * len(expected) + 4
+            good = (header.table_at + 8 * header.chunks <= offsets) & (offsets <= file_size - leader)
+            words = [_read(file, at, leader) for at in np.where(good, offsets, header.table_at).tolist()]
+            *stated, size = np.frombuffer(b"".join(words), "<i4").reshape(index.size, -1).T.astype(np.int64)
+            good &= np.all([s == e for s, e in zip(stated, expected, strict=True)], axis=0)
+            good &= (size >= 0) & (offsets <= file_size - leader - size)
             if not good.all():
                 chunk = int(index[np.argmin(good)])
                 raise InputError(
@@ -59,7 +57,7 @@ def _leaders(header: ExrHeader, index: Indices) -> list[Indices]:
     return [*part, index % across, index // across, zero, zero]
 
 
-def _numbers(content: NDArray[np.uint8], at: Indices, dtype: str) -> Indices:
-    """Little-endian numbers at places in the file."""
-    gathered = np.ascontiguousarray(content[at[:, np.newaxis] + np.arange(np.dtype(dtype).itemsize)])
-    return gathered.view(dtype)[:, 0].astype(np.int64)
+def _read(file: RawIOBase, at: int, size: int) -> bytes:
+    """Bytes at a place in the file; zeros stand for what is no longer there."""
+    file.seek(at)
+    return (file.read(size) or b"").ljust(size, b"\0")

@@ -11,6 +11,7 @@ import struct
 import sys
 import tomllib
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -235,6 +236,16 @@ def test_nothing_but_the_sentence_reaches_the_terminal(
     path.write_bytes(sound.content[:-20] + b"\0" * 20)  # the header is sound, so that OpenEXR has to complain
     refused(lambda: read_exr(path))
     assert capfd.readouterr() == ("", "")
+
+
+def test_threads_that_read_at_once_lose_no_stderr(fuzz: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.exr"
+    path.write_bytes(parts_of(fuzz).joined(mended=True))
+    with ThreadPoolExecutor(8) as pool:
+        images = list(pool.map(lambda _: read_exr(path), range(200)))
+    assert all(np.array_equal(image.channels["Y"], images[0].channels["Y"]) for image in images)
+    os.write(2, b"still here")
+    assert capfd.readouterr().err == "still here"
 
 
 # -- TOML -------------------------------------------------------------------------------------------------------
