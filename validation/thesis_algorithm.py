@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from wallmirror import CaptureSet, Card, GaussianTrain, Observer, radiance, scan_angles, transport_matrix
+from wallmirror import CaptureSet, Card, GaussianTrain, InputError, Observer, radiance, scan_angles, transport_matrix
 from wallmirror.captures.recorded import read_recorded_run
 from wallmirror.derendering.chaining import chain_views
 from wallmirror.derendering.unstructured import de_render_unstructured
@@ -192,7 +192,10 @@ def operator(report: Report) -> dict[str, Any]:
 def recorded(path: Path, seeds: int, report: Report) -> dict[str, Any]:
     """The recorded run: is its estimate on our chain and support, and does exact alternation come out below it?"""
     print("\nthe recorded run (alpha 10)")
-    run = read_recorded_run(path)
+    try:
+        run = read_recorded_run(path)
+    except InputError as error:
+        sys.exit(str(error))
     observer, card = run.observer, run.card
     captures = CaptureSet(observer=observer, card=card, transport="thesis", radiance=run.radiance)
     chain = chain_views(observer)
