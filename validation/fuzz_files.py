@@ -2,13 +2,13 @@
 
     python validation/fuzz_files.py [--seconds 500] [--workers 2] [--out validation/results]
 
-Makes EXR files, capture sets, scenes, pictures, truths and MATLAB files hostile (bytes flipped, lost, spliced; headers,
-tables, tags, fields and checksums changed one by one), and hands each to its public reader in a process of its own
-with a limit of memory and of time. An input is refused well if the reader raises an InputError that names the file in
-one short sentence. It is accepted well if what comes out is what the sound file held, or what the damaged one holds by
-an independent reading: a decoder written from EXR's specification, the standard library's TOML and JSON, and SciPy's
-loadmat. Compressed EXR pixels that this decoder cannot unpack and that no checksum protects are counted as unjudged.
-Anything else is a fault. Inputs follow from their number alone.
+Makes EXR files, capture sets, scenes, pictures, truths, MATLAB files and tables of BRDFs hostile (bytes flipped, lost,
+spliced; headers, tables, tags, fields and checksums changed one by one), and hands each to its public reader in a
+process of its own with a limit of memory and of time. An input is refused well if the reader raises an InputError that
+names the file in one short sentence. It is accepted well if what comes out is what the sound file held, or what the
+damaged one holds by an independent reading: a decoder written from EXR's specification, the standard library's TOML
+and JSON, SciPy's loadmat, and plain Python for tables. Compressed EXR pixels that this decoder cannot unpack and that
+no checksum protects are counted as unjudged. Anything else is a fault. Inputs follow from their number alone.
 
 A run that --seconds cut short goes on where it stopped when started again. Leaves fuzz_files.json, and leaves with 1 if
 there is a fault, 3 if inputs remain.
@@ -36,6 +36,7 @@ from typing import Any
 
 import fuzz_exr
 import fuzz_mat
+import fuzz_tables
 import fuzz_toml
 
 from wallmirror import load_scene, read_captures, read_truth
@@ -46,7 +47,15 @@ from wallmirror.files import write_atomically
 from wallmirror.picture_reading import load_picture
 
 #: How many inputs of each kind the recorded run tries.
-INPUTS = {"exr": 12_000, "captures": 4_000, "scene": 3_000, "picture": 1_500, "truth": 1_500, "mat": 3_000}
+INPUTS = {
+    "exr": 12_000,
+    "captures": 4_000,
+    "scene": 3_000,
+    "picture": 1_500,
+    "truth": 1_500,
+    "mat": 3_000,
+    "table": 3_000,
+}
 GOOD = ("refused", "same", "another", "unjudged")
 #: What one input may take: seconds, and bytes on top of what the process has before it.
 SECONDS, MEMORY = 20.0, 2**30
@@ -66,6 +75,13 @@ def try_input(kind: str, number: int, folder: Path) -> tuple[str, str, str]:
         path = folder / "input.mat"
         mat_sound, mutation, content = fuzz_mat.hostile(number)
         return judged(path, mutation, content, read_recorded_run, lambda r: fuzz_mat.verdict(mat_sound, content, r))
+    if kind == "table":
+        suffix, mutation, content = fuzz_tables.hostile(number)
+        path = fuzz_tables.lay_out(folder, suffix, content)
+        return judged(
+            path, mutation, path.read_bytes(), load_scene,
+            lambda scene: "another" if fuzz_tables.judge(suffix, content, scene) else "silent",
+        )  # fmt: skip
     if kind == "truth":
         mutation, content = fuzz_toml.hostile_truth(number)
         (folder / "truth").mkdir(exist_ok=True)

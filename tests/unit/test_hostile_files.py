@@ -6,10 +6,12 @@ The inputs are those of validation/fuzz_files.py, of which the recorded run trie
 from __future__ import annotations
 
 import importlib
+import io
 import os
 import struct
 import sys
 import tomllib
+import tracemalloc
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -377,6 +379,30 @@ def test_pipes_are_not_waited_for(tmp_path: Path) -> None:
                lambda: read_captures(tmp_path), lambda: read_truth(tmp_path), lambda: read_exr(tmp_path / "a.exr"))  # fmt: skip
     for read in readers:
         assert refused(read).message == "is not a file"
+
+
+@pytest.mark.parametrize("shape", ["(1099511627776,)", "(1048576, 1048576)", "(33554433,)"])
+def test_tables_whose_header_lies_are_refused_before_they_are_allocated(tmp_path: Path, shape: str) -> None:
+    buffer = io.BytesIO()
+    np.save(buffer, np.ones(49))
+    content = buffer.getvalue()
+    start = content.index(b"(49,)")
+    # The header keeps its length: what the shape needs is taken from its padding.
+    lying = content[:start] + shape.encode() + content[start + 5 :].replace(b" " * (len(shape) - 5), b"", 1)
+    (tmp_path / "wall.npy").write_bytes(lying)
+    path = scene(tmp_path / "a.toml")
+    path.write_text(path.read_text().replace('"diffuse"\nalbedo = 0.5', '"table"\nfile = "wall.npy"'))
+    tracemalloc.start()
+    try:
+        error = refused(lambda: load_scene(path))
+        assert tracemalloc.get_traced_memory()[1] < 2**22
+    finally:
+        tracemalloc.stop()
+    assert error.field == "wall.file"
+    assert "its header states" in error.message
+    # The twin: the sound header is read.
+    (tmp_path / "wall.npy").write_bytes(content)
+    assert np.asarray(load_scene(path).wall.brdf(0.1, 0.1)) == 1
 
 
 # -- paths ------------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +29,9 @@ from wallmirror.captures.unfinished import UnfinishedSet, unfinished_folder
 from wallmirror.errors import InputError
 from wallmirror.exr import read_exr
 from wallmirror.files import write_together
-from wallmirror.jobs.capturing import fingerprint, truth_of
+from wallmirror.jobs.capturing import fingerprint, planned_before, truth_of
 from wallmirror.jobs.solving import Solved, write_solution
+from wallmirror.planning import CapturePlan, Sampling, Term
 from wallmirror.scene import Scene
 
 from .helpers import refused
@@ -402,6 +403,30 @@ def test_read_only_files_and_folders_are_told(tmp_path: Path) -> None:
     finally:
         (tmp_path / "out").chmod(0o700)
     assert contents(tmp_path / "out") == {name: text.encode() for name, text in OLD.items()}
+
+
+def test_a_plan_is_kept_with_its_captures(filmed: tuple[Scene, CaptureSet], tmp_path: Path) -> None:
+    """Plans rest on timings: made anew they would differ, and the captures could not be taken up."""
+    scene, captures = filmed
+    sampling = Sampling(sampler="multijitter", spp=64, seeds=5, noise=1 / 300, seconds=0.1 + 0.2)
+    terms = (Term(name="noise", error=1e-3, kind="noise"), Term(name="depth", error=1 / 3, kind="bias", limit=True))
+    plan = CapturePlan(
+        tolerance=0.01, sampling=sampling, max_depth=4, rr_depth=5, table_nodes=None, films=8, terms=terms
+    )
+    settings = {**SETTINGS, "scene_sha256": fingerprint(scene), "plan": json.loads(json.dumps(asdict(plan)))}
+    assert planned_before(scene, tmp_path / "set", 0.01) is None
+    fill(UnfinishedSet(tmp_path / "set", settings), captures, 2)
+    assert planned_before(scene, tmp_path / "set", 0.01) == plan
+    assert UnfinishedSet(tmp_path / "set", settings).finished == 2
+    # The twins: another tolerance or scene has another plan, and captures without one have none.
+    assert planned_before(scene, tmp_path / "set", 0.02) is None
+    assert (
+        planned_before(replace(scene, room=None, wall=replace(scene.wall, half_width=99.0)), tmp_path / "set", 0.01)
+        is None
+    )
+    for number, other in enumerate(({}, {"plan": None}, {"plan": {"sampling": {}}}, {"plan": {"terms": 3}})):
+        fill(UnfinishedSet(tmp_path / str(number), {**SETTINGS, **other}), captures, 1)
+        assert planned_before(scene, tmp_path / str(number), 0.01) is None
 
 
 def test_fingerprints_tell_scenes_apart() -> None:
