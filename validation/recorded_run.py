@@ -11,61 +11,21 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
-from scipy.io import loadmat
 
-from wallmirror import (
-    CaptureSet,
-    Card,
-    GaussianTrain,
-    Observer,
-    radiance,
-    scan_angles,
-    solve,
-    transport_matrix,
-    wall_points,
-)
-
-FIELDS = ("g", "s", "s_est", "brdf_mat", "brdf_est", "x_axis", "obs")
+from wallmirror import CaptureSet, GaussianTrain, InputError, radiance, solve, transport_matrix, wall_points
+from wallmirror.captures.recorded import RecordedRun, read_recorded_run
 
 
-def load(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of the recorded run in our axes: g (A, N, B), BRDF (A, N, M)."""
-    try:
-        recorded = loadmat(path)
-    except (OSError, ValueError, NotImplementedError) as error:
-        sys.exit(f"{path}: cannot be read as a MATLAB file ({error})")
-    missing = [name for name in FIELDS if name not in recorded]
-    if missing:
-        sys.exit(f"{path}: lacks {', '.join(missing)}; this is not the thesis's recorded run")
-    for name in ("g", "brdf_mat", "brdf_est"):
-        recorded[name] = recorded[name].transpose(2, 0, 1)
-    return recorded
-
-
-def geometry(recorded: dict[str, np.ndarray]) -> tuple[Observer, Card]:
-    """Observer and card from `obs` = [x y start end A B width focus]; the card is 5 wide at y = -1 (table 4.3)."""
-    x, y, start, end, views, _, fov, _ = recorded["obs"].ravel()
-    observer = Observer(
-        position=(float(x), float(y)),
-        fov=math.radians(fov),
-        view_angles=scan_angles(int(views), scan=math.radians(start - end), fov=math.radians(fov)),
-        pixels=recorded["g"].shape[1],
-        pixels_at="edges",
-    )
-    return observer, Card(elements_x=tuple(np.linspace(-2.5, 2.5, recorded["s"].shape[0])), y=-1.0)
-
-
-def scaled_errors(source: np.ndarray, brdf: np.ndarray, recorded: dict[str, np.ndarray]) -> tuple[float, float]:
+def scaled_errors(source: np.ndarray, brdf: np.ndarray, recorded: RecordedRun) -> tuple[float, float]:
     """Mean square errors of pattern and BRDF after the one global scale that no method can know."""
-    scale = np.sum(source * recorded["s"]) / np.sum(source**2)
-    source_error = np.mean((scale * source - recorded["s"]) ** 2)
-    return float(source_error), float(np.mean((brdf / scale - recorded["brdf_mat"]) ** 2))
+    scale = np.sum(source * recorded.source) / np.sum(source**2)
+    source_error = np.mean((scale * source - recorded.source) ** 2)
+    return float(source_error), float(np.mean((brdf / scale - recorded.brdf) ** 2))
 
 
 def main() -> int:
@@ -73,16 +33,19 @@ def main() -> int:
     parser.add_argument("path", type=Path)
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     arguments = parser.parse_args()
-    recorded = load(arguments.path)
-    observer, card = geometry(recorded)
+    try:
+        recorded = read_recorded_run(arguments.path)
+    except InputError as error:
+        sys.exit(str(error))
+    observer, card = recorded.observer, recorded.card
 
     model = transport_matrix(observer, card, GaussianTrain.of_the_code(), weights="thesis")
     forward = {
-        "wall points": float(np.max(np.abs(wall_points(observer) - recorded["x_axis"]))),
-        "weighted BRDF": float(np.max(np.abs(model - recorded["brdf_mat"]))),
-        "renders": float(np.max(np.abs(radiance(model, recorded["s"]) - recorded["g"]))),
+        "wall points": float(np.max(np.abs(wall_points(observer) - recorded.wall_x))),
+        "weighted BRDF": float(np.max(np.abs(model - recorded.brdf))),
+        "renders": float(np.max(np.abs(radiance(model, recorded.source) - recorded.radiance))),
     }
-    captures = CaptureSet(observer=observer, card=card, transport="thesis", radiance=recorded["g"])
+    captures = CaptureSet(observer=observer, card=card, transport="thesis", radiance=recorded.radiance)
     seconds = []
     for _ in range(5):  # the first call also pays for imports inside SciPy
         started = time.perf_counter()
@@ -90,10 +53,10 @@ def main() -> int:
         seconds.append(time.perf_counter() - started)
     ours = scaled_errors(solution.source, solution.transport, recorded)
     plain = (
-        float(np.mean((recorded["s_est"] - recorded["s"]) ** 2)),
-        float(np.mean((recorded["brdf_est"] - recorded["brdf_mat"]) ** 2)),
+        float(np.mean((recorded.source_estimate - recorded.source) ** 2)),
+        float(np.mean((recorded.brdf_estimate - recorded.brdf) ** 2)),
     )
-    scaled = scaled_errors(recorded["s_est"], recorded["brdf_est"], recorded)
+    scaled = scaled_errors(recorded.source_estimate, recorded.brdf_estimate, recorded)
     passed = max(forward.values()) <= 1e-12 and max(ours) <= 1e-24
     result = {
         "forward_max_difference": forward,

@@ -25,10 +25,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from recorded_run import geometry, load
 from scipy.optimize import linear_sum_assignment
 
-from wallmirror import CaptureSet, Card, GaussianTrain, Observer, radiance, scan_angles, transport_matrix
+from wallmirror import CaptureSet, Card, GaussianTrain, InputError, Observer, radiance, scan_angles, transport_matrix
+from wallmirror.captures.recorded import read_recorded_run
 from wallmirror.derendering.chaining import chain_views
 from wallmirror.derendering.unstructured import de_render_unstructured
 
@@ -192,23 +192,26 @@ def operator(report: Report) -> dict[str, Any]:
 def recorded(path: Path, seeds: int, report: Report) -> dict[str, Any]:
     """The recorded run: is its estimate on our chain and support, and does exact alternation come out below it?"""
     print("\nthe recorded run (alpha 10)")
-    run = load(path)
-    observer, card = geometry(run)
-    captures = CaptureSet(observer=observer, card=card, transport="thesis", radiance=run["g"])
+    try:
+        run = read_recorded_run(path)
+    except InputError as error:
+        sys.exit(str(error))
+    observer, card = run.observer, run.card
+    captures = CaptureSet(observer=observer, card=card, transport="thesis", radiance=run.radiance)
     chain = chain_views(observer)
-    theirs = chain.structured(run["brdf_est"])
-    off_chain = float(np.max(np.abs(chain.spread(theirs) - run["brdf_est"])))
+    theirs = chain.structured(run.brdf_estimate)
+    off_chain = float(np.max(np.abs(chain.spread(theirs) - run.brdf_estimate)))
     report.add("its BRDF off our chain", "0", off_chain, 0)
-    misfit = float(np.sum((run["g"] - run["brdf_est"] @ run["s_est"]) ** 2))
+    misfit = float(np.sum((run.radiance - run.brdf_estimate @ run.source_estimate) ** 2))
     report.add("its objective", "1841.03", misfit + 10 * float(np.sum(theirs)), 0.005)
     found = [de_render_unstructured(captures, rng=seed) for seed in range(seeds)]
-    mean = chain.structured(run["g"].mean(axis=2, keepdims=True))[:, 0]
+    mean = chain.structured(run.radiance.mean(axis=2, keepdims=True))[:, 0]
     off_support = theirs.ravel(order="F")[np.argsort(-np.tile(mean, 4), kind="stable")[found[0].support :]]
     report.add("its BRDF off our support", "0", float(np.max(np.abs(off_support))), 0)
     ends = np.array([s.objective[-1, 1] for s in found])
     best = found[int(np.argmin(ends))]
     report.add(f"exact, lowest of {seeds} seeds: objective", "1840.3", float(ends.min()), 0.05)
-    source, brdf = np.mean((best.source - run["s"]) ** 2), np.mean((best.brdf - run["brdf_mat"]) ** 2)
+    source, brdf = np.mean((best.source - run.source) ** 2), np.mean((best.brdf - run.brdf) ** 2)
     report.add("the same: source", "0.0177", float(source), 0.0005)
     report.add("the same: BRDF", "0.0073", float(brdf), 0.00005)
     near = int(np.count_nonzero(ends < ends.min() + 0.5))

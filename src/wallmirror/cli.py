@@ -186,10 +186,15 @@ def capture(
         float | None,
         typer.Option(help="Error wanted, as for `advise`, which then chooses samples, seeds and depth."),
     ] = None,
+    restart: Annotated[bool, typer.Option("--restart", help="Throw away what an interrupted run left.")] = False,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Render a scene's views and patterns to EXR files with a captures.toml, ready to solve."""
+    """Render a scene's views and patterns to EXR files with a captures.toml, ready to solve.
+
+    The same command goes on where an interrupted one stopped.
+    """
+    from wallmirror.captures.unfinished import unfinished_folder
     from wallmirror.jobs.capturing import capture_scene
     from wallmirror.scene import load_scene
 
@@ -198,12 +203,21 @@ def capture(
     plan = None
     if tolerance is not None:
         from wallmirror.jobs.advising import plan_capture
+        from wallmirror.jobs.capturing import planned_before
         from wallmirror.planning.words import capture_line
 
-        plan = plan_capture(loaded, tolerance, seed=seed)
+        kept = None if restart else planned_before(loaded, out, tolerance)
+        plan = kept or plan_capture(loaded, tolerance, seed=seed)
         terminal.note(f"planned: {capture_line(plan)}")
-    with terminal.progress(f"filming {loaded.name}") as advance:
-        captures = capture_scene(loaded, out, spp=spp, seed=seed, max_depth=max_depth, plan=plan, progress=advance)
+    try:
+        with terminal.progress(f"filming {loaded.name}") as advance:
+            captures = capture_scene(
+                loaded, out, spp=spp, seed=seed, max_depth=max_depth, plan=plan, restart=restart, progress=advance
+            )
+    except KeyboardInterrupt:
+        if unfinished_folder(out).is_dir():
+            terminal.note(f"what is finished lies in {unfinished_folder(out)}; the same command goes on from there")
+        raise
     views, pixels, realisations = captures.radiance.shape
     terminal.say(f"{views} views x {realisations} patterns of {pixels} pixels in {out}")
     terminal.say(f"next: wallmirror solve {out} -o {out.with_name(out.name + '_solved')}")
@@ -338,7 +352,9 @@ def main(arguments: list[str] | None = None) -> None:
         document: dict[str, Any] = {"error": str(error), "exit_code": error.exit_code}
         terminal.document(document)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit) as end:  # Typer turns Ctrl-C into exit code 130 without a word
+        if isinstance(end, SystemExit) and end.code != 130:
+            raise
         Terminal().error("interrupted; earlier results are untouched")
         sys.exit(130)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import reprlib
 from pathlib import Path
+from typing import Any
 
 
 class WallmirrorError(Exception):
@@ -45,3 +47,24 @@ class MissingRuntimeError(WallmirrorError):
     """Mitsuba cannot run as asked; the message says what to install."""
 
     exit_code = 1
+
+
+def shown(value: Any, *, quote: bool = True) -> str:
+    """A value from a file, fit for a sentence: one short line without control characters, whatever the file says.
+
+    Examples
+    --------
+    >>> shown("two\\nlines"), shown(10**5000), shown([[[[1]]], 2]), len(shown("x" * 1000))
+    ("'two\\\\nlines'", 'a huge number', '[[[[...]]], 2]', 57)
+    """
+    if isinstance(value, str) and not quote:
+        line = "".join(c if c.isprintable() else "?" for c in value)
+        return line if len(line) <= _SHOWN.maxstring + 60 else f"{line[: _SHOWN.maxstring]}..."
+    try:
+        return _SHOWN.repr(value)
+    except (ValueError, RecursionError):  # an integer of more than 4300 digits
+        return "a huge number"
+
+
+_SHOWN = reprlib.Repr()
+_SHOWN.maxlevel, _SHOWN.maxlist, _SHOWN.maxdict, _SHOWN.maxstring, _SHOWN.maxother = 3, 4, 4, 57, 57

@@ -1,8 +1,9 @@
 """Float32 EXR images in and out, with exact settings and checksums in one JSON attribute called `wallmirror`.
 
 OpenEXR itself notices little: it reads most byte-flipped files without a word, prints its complaint about a file
-cut short on stdout and returns nothing, and reports no error when the disk is full. Hence the checksums, verified
-on reading wherever the attribute is present, and the reading back of every file before it gets its name.
+cut short on stdout or stderr and returns nothing, and reports no error when the disk is full. Hence the checksums,
+verified on reading wherever the attribute is present, the header and table that are judged before OpenEXR sees them,
+and the reading back of every file before it gets its name.
 """
 
 from __future__ import annotations
@@ -11,8 +12,11 @@ import contextlib
 import hashlib
 import io
 import json
+import os
 import secrets
-from collections.abc import Mapping
+import sys
+import threading
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +26,8 @@ import OpenEXR
 from numpy.typing import ArrayLike, NDArray
 
 from wallmirror.errors import InputError
+from wallmirror.exr_chunks import require_sound_chunks
+from wallmirror.exr_header import ExrHeader, read_exr_header
 
 Pixels = NDArray[np.float32]
 
@@ -29,7 +35,7 @@ Pixels = NDArray[np.float32]
 MAX_PIXELS = 2**27
 
 _ATTRIBUTE = "wallmirror"
-_MAGIC = b"\x76\x2f\x31\x01"
+_SILENCING = threading.Lock()  # the process has one stderr
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +113,7 @@ def write_exr(
 def read_exr(path: str | Path, *, max_pixels: int = MAX_PIXELS) -> ExrImage:
     """Read the float and half channels of an EXR file, verified where it carries checksums.
 
-    Not for several threads at once: sys.stdout is diverted meanwhile.
+    Threads read one after the other, since what OpenEXR prints is diverted meanwhile.
 
     Parameters
     ----------
@@ -121,14 +127,17 @@ def read_exr(path: str | Path, *, max_pixels: int = MAX_PIXELS) -> ExrImage:
         image. Values are not judged: NaN and infinity pass.
     """
     path = Path(path)
-    _require_exr(path)
-    header, _ = _load(path, header_only=True)
-    _require_flat_and_small(path, header, max_pixels)
-    header, loaded = _load(path, header_only=False)
+    header = read_exr_header(path, max_samples=max_pixels)
+    require_sound_chunks(path, header)
+    loaded = _load(path)
+    if {name: array.shape for name, array in loaded.items()} != dict.fromkeys(
+        header.channels, (header.rows, header.columns)
+    ):
+        raise InputError("is damaged or cut short: OpenEXR reads other channels than its header states", file=path)
     half = {name: array.dtype == np.float16 for name, array in loaded.items() if array.dtype.kind == "f"}
     if not half:
         raise InputError("holds no channel of floats", file=path)
-    channels = {name: np.ascontiguousarray(loaded[name], dtype=np.float32) for name in half}
+    channels = {name: np.ascontiguousarray(loaded.pop(name), dtype=np.float32) for name in half}
     return ExrImage(channels, half, _verified_settings(path, header, channels))
 
 
@@ -144,54 +153,35 @@ def _float32(values: ArrayLike, name: str, path: Path) -> Pixels:
     return rounded
 
 
-def _load(path: Path, *, header_only: bool) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Header and pixels of a single-part file: OpenEXR drops a damaged part with no more than a line on stdout."""
+def _load(path: Path) -> dict[str, NDArray[Any]]:
+    """Pixels of a single-part file: OpenEXR drops a damaged part with no more than a line on stdout or stderr."""
     try:
-        with (
-            contextlib.redirect_stdout(io.StringIO()),
-            OpenEXR.File(str(path), separate_channels=True, header_only=header_only) as file,
-        ):
-            parts = len(file.parts)
-            if parts == 1:
-                # Copied, since leaving the block empties both.
-                header = dict(file.header())
-                return header, {name: channel.pixels for name, channel in file.channels().items()}
+        with _silence(), OpenEXR.File(str(path), separate_channels=True) as file:
+            if file.parts:
+                # Copied, since leaving the block empties it.
+                return {name: channel.pixels for name, channel in file.channels().items()}
     except (RuntimeError, ValueError) as error:  # UnicodeDecodeError, from flipped names, is a ValueError
         raise InputError("is damaged or cut short: OpenEXR cannot read it", file=path) from error
-    if parts > 1:
-        raise InputError(f"holds {parts} images; give a file with one", file=path)
     raise InputError("is damaged or cut short: OpenEXR cannot read its pixels", file=path)
 
 
-def _require_exr(path: Path) -> None:
-    """Refuse what is no EXR file, which OpenEXR would also announce on stderr."""
-    if not path.exists():
-        raise InputError("no such file", file=path)
-    if not path.is_file():
-        raise InputError("is not a file", file=path)
-    try:
-        with path.open("rb") as file:
-            start = file.read(len(_MAGIC))
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=path) from None
-    if start != _MAGIC:
-        raise InputError("is empty" if not start else "is not an EXR file", file=path)
-
-
-def _require_flat_and_small(path: Path, header: dict[str, Any], max_pixels: int) -> None:
-    if header.get("type", OpenEXR.scanlineimage) not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
-        raise InputError("is a deep EXR file; give a flat one", file=path)
-    if any(channel.xSampling != 1 or channel.ySampling != 1 for channel in header["channels"]):
-        raise InputError("has channels at reduced resolution; give every channel all its pixels", file=path)
-    (left, top), (right, bottom) = (corner.tolist() for corner in header["dataWindow"])
-    rows, columns = bottom - top + 1, right - left + 1
-    samples = rows * columns * len(header["channels"])
-    if rows < 1 or columns < 1 or samples > max_pixels:
-        raise InputError(
-            f"states {columns} x {rows} pixels in {len(header['channels'])} channels; "
-            f"at least one and at most {max_pixels} numbers are read",
-            file=path,
-        )
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Drop what Python prints and what C code writes to stderr: a refusal is one sentence."""
+    with _SILENCING, contextlib.redirect_stdout(io.StringIO()):
+        try:
+            sys.stderr.flush()
+            kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+        except (OSError, ValueError, AttributeError):  # a process without a stderr
+            yield
+            return
+        try:
+            os.dup2(nowhere, 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            os.close(nowhere)
 
 
 def _attribute(channels: Mapping[str, Pixels], settings: Mapping[str, Any] | None) -> str:
@@ -205,12 +195,13 @@ def _attribute(channels: Mapping[str, Pixels], settings: Mapping[str, Any] | Non
     )
 
 
-def _verified_settings(path: Path, header: Mapping[str, Any], channels: Mapping[str, Pixels]) -> dict[str, Any] | None:
+def _verified_settings(path: Path, header: ExrHeader, channels: Mapping[str, Pixels]) -> dict[str, Any] | None:
     """The settings in the attribute once its checksums agree with pixels and settings; None without attribute."""
-    if _ATTRIBUTE not in header:
+    if _ATTRIBUTE.encode() not in header.attributes:
         return None
+    kind, text = header.attributes[_ATTRIBUTE.encode()]
     try:
-        carried = json.loads(header[_ATTRIBUTE])
+        carried = json.loads(text if kind == b"string" else b"")
         settings, pixel_sums, settings_sum = (carried[k] for k in ("settings", "sha256", "settings_sha256"))
     except (ValueError, TypeError, KeyError, RecursionError):
         raise InputError("was altered: its wallmirror attribute cannot be read", file=path) from None
@@ -225,7 +216,7 @@ def _verified_settings(path: Path, header: Mapping[str, Any], channels: Mapping[
 
 
 def _pixel_digest(pixels: Pixels) -> str:
-    return hashlib.sha256(pixels.astype("<f4").tobytes()).hexdigest()
+    return hashlib.sha256(np.ascontiguousarray(pixels, dtype="<f4").data).hexdigest()
 
 
 def _settings_digest(settings: Any) -> str:

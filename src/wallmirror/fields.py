@@ -6,14 +6,16 @@ import difflib
 import importlib.resources
 import math
 import sys
-import tomllib
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any, TypeVar
 
-from wallmirror.errors import InputError
+from wallmirror.errors import InputError, shown
+from wallmirror.toml import parse_toml
 
 Word = TypeVar("Word", bound=str)
+
+_MAX_PATH = 1000  # characters
 
 
 def shipped_names(folder: str) -> tuple[str, ...]:
@@ -43,17 +45,8 @@ def _shipped(folder: str) -> Path:
 
 
 def read_toml(path: Path) -> Fields:
-    """Parse a TOML file into its root `Fields`; InputError names the file if it is absent or malformed."""
-    try:
-        text = path.read_bytes().decode("utf-8")
-    except FileNotFoundError:
-        raise InputError("no such file", file=path) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read as UTF-8 text ({error})", file=path) from None
-    try:
-        return Fields(tomllib.loads(text), file=path)
-    except (ValueError, RecursionError) as error:  # a number of 5000 digits or 5000 nested lists are no decode errors
-        raise InputError(f"is not valid TOML: {error}", file=path) from None
+    """Parse a TOML file into its root `Fields`; InputError names the file if it is absent, too long or malformed."""
+    return Fields(parse_toml(path), file=path)
 
 
 class Fields:
@@ -76,6 +69,7 @@ class Fields:
 
     def error(self, name: str, message: str) -> InputError:
         """An InputError located at one field of this table."""
+        name = shown(name, quote=False)
         return InputError(message, file=self.file, field=f"{self.path}.{name}" if self.path else name)
 
     def has(self, name: str) -> bool:
@@ -87,7 +81,7 @@ class Fields:
         """true or false."""
         value = self._take(name, default)
         if not isinstance(value, bool):
-            raise self.error(name, f"is {value!r}; give true or false")
+            raise self.error(name, f"is {shown(value)}; give true or false")
         return value
 
     def number(
@@ -100,17 +94,17 @@ class Fields:
         """A whole number in [low, high]; required when there is no default."""
         value = self._take(name, default)
         if isinstance(value, bool) or not isinstance(value, int):
-            raise self.error(name, f"is {value!r}; give a whole number")
+            raise self.error(name, f"is {shown(value)}; give a whole number")
         if not low <= value <= high:
-            shown = value if abs(value) < 10**20 else "huge"
-            raise self.error(name, f"is {shown}; give a whole number from {low} to {high}")
+            size = value if abs(value) < 10**20 else "huge"
+            raise self.error(name, f"is {size}; give a whole number from {low} to {high}")
         return value
 
     def numbers(self, name: str, default: Sequence[float] | None = None, *, size: int = 0) -> tuple[float, ...]:
         """A list of finite numbers, of the given size unless that is 0; required when there is no default."""
         value = self._take(name, default)
         if not isinstance(value, (list, tuple)):
-            raise self.error(name, f"is {value!r}; give a list of numbers")
+            raise self.error(name, f"is {shown(value)}; give a list of numbers")
         if size and len(value) != size:
             raise self.error(name, f"has {len(value)} entries; give {size}")
         return tuple(self._as_number(name, entry, -math.inf, math.inf) for entry in value)
@@ -124,7 +118,7 @@ class Fields:
         """A string; required when there is no default."""
         value = self._take(name, default)
         if not isinstance(value, str):
-            raise self.error(name, f"is {value!r}; give a text in quotes")
+            raise self.error(name, f"is {shown(value)}; give a text in quotes")
         return value
 
     def inside(self, name: str, folder: str) -> Path:
@@ -137,14 +131,20 @@ class Fields:
         """
         text = self.text(name)
         directory = self.file.parent
-        if not text or "\0" in text or Path(text).is_absolute():
-            raise self.error(name, f"is {text!r}; give the name of a file in the {folder} folder")
+        # A backslash or drive letter would mean a folder on one system and a name on another.
+        foreign = "\\" in text or bool(PureWindowsPath(text).drive)
+        if not text.isprintable() or not 0 < len(text) <= _MAX_PATH or foreign or Path(text).is_absolute():
+            raise self.error(
+                name, f"is {shown(text)}; give the name of a file in the {folder} folder, such as raw/a.exr"
+            )
         try:
             leaves = not (directory / text).resolve().is_relative_to(directory.resolve())
         except (OSError, RuntimeError):  # links that go round in circles
             leaves = True
         if leaves:
-            raise self.error(name, f'"{text}" leads out of the {folder} folder; move the file into it')
+            raise self.error(
+                name, f'"{shown(text, quote=False)}" leads out of the {folder} folder; move the file into it'
+            )
         return directory / text
 
     def texts(self) -> dict[str, str]:
@@ -155,14 +155,14 @@ class Fields:
         """One of a few strings."""
         value = self.text(name, default)
         if value not in options:
-            raise self.error(name, f'is "{value}"; choose {_listed(options)}')
+            raise self.error(name, f'is "{shown(value, quote=False)}"; choose {_listed(options)}')
         return value
 
     def table(self, name: str, *, required: bool = True) -> Fields:
         """A sub-table; an absent optional one reads as empty."""
         value = self._take(name, None if required else {})
         if not isinstance(value, dict):
-            raise self.error(name, f"is {value!r}; give a table [{name}]")
+            raise self.error(name, f"is {shown(value)}; give a table [{name}]")
         return Fields(value, file=self.file, path=f"{self.path}.{name}" if self.path else name)
 
     def tables(self, name: str) -> list[Fields]:
@@ -201,7 +201,7 @@ class Fields:
 
     def _as_number(self, name: str, value: Any, low: float, high: float) -> float:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise self.error(name, f"holds {value!r}; give finite numbers")
+            raise self.error(name, f"holds {shown(value)}; give finite numbers")
         if not abs(value) <= sys.float_info.max:  # NaN, infinity, and integers that no float can hold
             raise self.error(
                 name, f"holds {value if isinstance(value, float) else 'a huge number'}; give finite numbers"

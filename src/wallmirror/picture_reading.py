@@ -201,7 +201,8 @@ def _sphere_field(fields: Fields, listed: tuple[Shape, ...]) -> tuple[Shape, ...
 
     The kinds, colours and places are those of the scene that ends "Ray Tracing in One Weekend".
     """
-    columns, rows = (fields.integer(name, low=1, high=200) for name in ("columns", "rows"))
+    # Each sphere is held against all others: 4096 take a second.
+    columns, rows = (fields.integer(name, low=1, high=64) for name in ("columns", "rows"))
     radius = fields.number("radius", low=1e-6, high=0.5)
     diffuse = fields.number("diffuse", low=0.0, high=1.0)
     metal = fields.number("metal", low=0.0, high=1.0)

@@ -6,13 +6,14 @@ a background. Lengths are in whatever unit its file is written in (`picture_read
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wallmirror.brdf import AngleSumBRDF
-from wallmirror.errors import InputError
+from wallmirror.errors import InputError, shown
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -204,12 +205,14 @@ class PictureScene:
     def __post_init__(self) -> None:
         names = [shape.name for shape in self.shapes]
         for what, all_names in (("shape", names), ("region", [region.name for region in self.regions])):
-            twice = {name for name in all_names if all_names.count(name) > 1}
+            twice = sorted(name for name, count in Counter(all_names).items() if count > 1)
             if twice:
-                raise InputError(f'two are called "{min(twice)}"; give each a name of its own', field=f"{what}.name")
+                message = f'two are called "{shown(twice[0], quote=False)}"; give each a name of its own'
+                raise InputError(message, field=f"{what}.name")
+        known = set(names)
         for region in self.regions:
-            if region.shape not in names:
-                raise InputError(f'no shape is called "{region.shape}"', field="region.shape")
+            if region.shape not in known:
+                raise InputError(f'no shape is called "{shown(region.shape, quote=False)}"', field="region.shape")
         sky = self.background
         if not any(shape.shines for shape in self.shapes) and (sky is None or not any(sky.nadir + sky.zenith)):
             raise InputError("nothing shines; give a shape an emission, or a background", field="shape.emission")

@@ -13,6 +13,7 @@ from wallmirror.brdf import BRDF
 from wallmirror.errors import InputError
 from wallmirror.fields import Fields, named_toml, read_toml, shipped_names
 from wallmirror.geometry import Card, Observer, scan_angles, wall_points
+from wallmirror.limits import require_affordable
 from wallmirror.wall_reading import read_brdf
 
 Array = NDArray[np.float64]
@@ -154,7 +155,16 @@ def _scene(root: Fields, *, name: str) -> Scene:
         render=_render(root.table("render", required=False)),
     )
     root.finish()
+    require_affordable_films(scene.observer, realisations=scene.source.shape[1], elements=card.elements)
     return scene
+
+
+def require_affordable_films(observer: Observer, *, realisations: int, elements: int) -> None:
+    """Refuse films or a transport matrix that would not fit into memory, with the size that they would have."""
+    films = ("views", "pixels", "realisations"), (observer.views, observer.pixels, realisations)
+    matrix = ("views", "pixels", "elements"), (observer.views, observer.pixels, elements)
+    for names, shape in (films, matrix):
+        require_affordable(shape, names, field="observer.pixels")
 
 
 def read_observer(fields: Fields) -> Observer:
@@ -231,7 +241,9 @@ def _source(fields: Fields, card: Card) -> Array:
         source = np.asarray(rows, dtype=np.float64).reshape(len(rows), -1).T
     else:
         rng = np.random.default_rng(fields.integer("seed", 0))
-        source = rng.random((card.elements, fields.integer("realisations", low=1, high=100_000)))
+        shape = (card.elements, fields.integer("realisations", low=1, high=100_000))
+        require_affordable(shape, ("elements", "realisations"), field="source.realisations")
+        source = rng.random(shape)
     fields.finish()
     with np.errstate(over="ignore"):  # refused as not finite by Scene
         return np.asarray(level * source, dtype=np.float64)

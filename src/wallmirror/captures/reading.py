@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wallmirror.captures.capture_set import CaptureSet, Truth
-from wallmirror.errors import InputError
+from wallmirror.errors import InputError, shown
 from wallmirror.exr import ExrImage, read_exr
 from wallmirror.fields import Fields, read_toml
+from wallmirror.files import read_bounded
 from wallmirror.geometry import Observer
-from wallmirror.scene import read_card, read_observer, read_room
+from wallmirror.scene import read_card, read_observer, read_room, require_affordable_films
 from wallmirror.transport import Weights
 
 Array = NDArray[np.float64]
@@ -35,6 +36,8 @@ TRUTH_FILE = "truth.json"
 _HALF_ULP = (2.0**-11, 2.0**-25)
 _FLOAT_ULP = (2.0**-24, 2.0**-150)
 _MAX_EXPOSURE = 1e12
+# 64 MiB: a truth of three million numbers.
+_MAX_TRUTH_BYTES = 2**26
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,7 @@ def read_truth(directory: str | Path) -> Truth | None:
     if not path.exists():
         return None
     try:
-        table = json.loads(path.read_bytes())
+        table = json.loads(read_bounded(path, _MAX_TRUTH_BYTES))
         if not isinstance(table, dict) or table.pop("format", None) != 1 or set(table) != _TRUTH_FIELDS:
             raise InputError(f"needs format 1 and the fields {', '.join(sorted(_TRUTH_FIELDS))}", file=path)
         values = {name: np.asarray(entry) for name, entry in table.items()}
@@ -141,6 +144,7 @@ def _capture_set(root: Fields) -> CaptureSet:
     captures = [_capture(fields, observer, channel, row) for fields in root.tables("captures")]
     root.finish()
     realisations = _require_complete(root, captures, observer)
+    require_affordable_films(observer, realisations=realisations, elements=card.elements)
 
     read = functools.lru_cache(maxsize=2)(read_exr)  # colours of one file are captures of their own
     shape = (observer.views, observer.pixels, realisations)
@@ -261,8 +265,8 @@ def _pixels(capture: _Capture, name: str, path: Path, image: ExrImage, observer:
     """The row and channel of an image that a capture uses, shape (N,)."""
     rows, columns = image.shape
     if capture.channel not in image.channels:
-        held = ", ".join(image.channels)
-        raise capture.fields.error(name, f'"{path.name}" has no channel "{capture.channel}"; it holds: {held}')
+        asked, held = (shown(text, quote=False) for text in (capture.channel, ", ".join(image.channels)))
+        raise capture.fields.error(name, f'"{path.name}" has no channel "{asked}"; it holds: {held}')
     if columns != observer.pixels:
         raise capture.fields.error(
             name, f'"{path.name}" is {columns} pixels wide, but observer.pixels is {observer.pixels}'

@@ -17,6 +17,7 @@ from wallmirror.captures.capture_set import CaptureSet, Truth
 from wallmirror.captures.reading import CAPTURES_FILE, TRUTH_FILE
 from wallmirror.errors import InputError
 from wallmirror.exr import write_exr
+from wallmirror.files import write_atomically
 
 _OWN_FILES = re.compile(rf"view\d+_real\d+(_variance)?\.exr|{re.escape(CAPTURES_FILE)}|{re.escape(TRUTH_FILE)}")
 _NOTE = b"# Written by wallmirror, which may replace this folder; remove this line to keep it."
@@ -60,11 +61,13 @@ def write_captures(
         raise InputError(f"has shape {truth.source.shape}; give {shape}", field="truth.source")
     scratch = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
     try:
-        _require_replaceable(target)
+        require_replaceable(target)
+        recover_swap(target)
         target.parent.mkdir(parents=True, exist_ok=True)
         scratch.mkdir()
-        _write_files(scratch, captures, settings, truth)
-        _swap(scratch, target)
+        _write_images(scratch, captures, settings or {})
+        write_texts(scratch, captures, truth)
+        swap(scratch, target)
     except OSError as error:
         raise InputError(f"cannot be written ({error.strerror or error})", file=target) from error
     except InputError as error:
@@ -74,7 +77,8 @@ def write_captures(
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def _require_replaceable(target: Path) -> None:
+def require_replaceable(target: Path) -> None:
+    """Refuse to replace anything but an empty folder or a set that `write_captures` wrote."""
     if not target.exists():
         return
     if not target.is_dir():
@@ -95,11 +99,12 @@ def _is_written_by_us(captures_file: Path) -> bool:
         return file.readline(len(_NOTE) + 1).strip() == _NOTE
 
 
-def _swap(scratch: Path, target: Path) -> None:
+def swap(scratch: Path, target: Path) -> None:
+    """Put a folder in the place of an earlier set; whatever happens, one of them is there in the end."""
     if not target.exists():
         scratch.rename(target)
         return
-    earlier = scratch.with_suffix(".earlier")
+    earlier = _earlier(target)
     target.rename(earlier)
     try:
         scratch.rename(target)
@@ -109,27 +114,57 @@ def _swap(scratch: Path, target: Path) -> None:
     shutil.rmtree(earlier, ignore_errors=True)
 
 
-def _write_files(folder: Path, captures: CaptureSet, settings: Mapping[str, Any] | None, truth: Truth | None) -> None:
+def recover_swap(target: Path) -> None:
+    """Undo a swap that a kill or a power cut left half done."""
+    earlier = _earlier(target)
+    if not earlier.is_dir():
+        return
+    require_replaceable(earlier)
+    if target.exists():
+        shutil.rmtree(earlier)
+    else:
+        earlier.rename(target)
+
+
+def _earlier(target: Path) -> Path:
+    return target.with_name(f".{target.name}.earlier")
+
+
+def file_names(view: int, realisation: int) -> dict[str, str]:
+    """Names of a capture's files by what they hold: "radiance" and "variance"."""
+    stem = f"view{view:02d}_real{realisation:02d}"
+    return {"radiance": f"{stem}.exr", "variance": f"{stem}_variance.exr"}
+
+
+def capture_settings(settings: Mapping[str, Any], view: int, realisation: int, holds: str) -> dict[str, Any]:
+    """What a capture's EXR file says of how it was made."""
+    return {**settings, "view": view, "realisation": realisation, "holds": holds}
+
+
+def _write_images(folder: Path, captures: CaptureSet, settings: Mapping[str, Any]) -> None:
+    for view in range(captures.observer.views):
+        for realisation in range(captures.realisations):
+            names = file_names(view, realisation)
+            for holds, values in (("radiance", captures.radiance), ("variance", captures.variance)):
+                if values is not None:
+                    row = values[view, :, realisation][np.newaxis]
+                    exact = capture_settings(settings, view, realisation, holds)
+                    write_exr(folder / names[holds], {"Y": row}, settings=exact)
+
+
+def write_texts(folder: Path, captures: CaptureSet, truth: Truth | None) -> None:
+    """Write captures.toml, which names the EXR files, and truth.json."""
     entries = []
     for view in range(captures.observer.views):
         for realisation in range(captures.realisations):
-            stem = f"view{view:02d}_real{realisation:02d}"
-            entry: dict[str, Any] = {"file": f"{stem}.exr", "view": view, "realisation": realisation}
-            exact = {**(settings or {}), "view": view, "realisation": realisation}
-            images = {"file": captures.radiance}
+            names = file_names(view, realisation)
+            entry: dict[str, Any] = {"file": names["radiance"], "view": view, "realisation": realisation}
             if captures.variance is not None:
-                entry["variance_file"] = f"{stem}_variance.exr"
-                images["variance_file"] = captures.variance
-            for name, values in images.items():
-                row = values[view, :, realisation][np.newaxis]
-                write_exr(folder / entry[name], {"Y": row}, settings={**exact, "holds": _CONTENT[name]})
+                entry["variance_file"] = names["variance"]
             entries.append(entry)
-    (folder / CAPTURES_FILE).write_text(_toml(captures, entries), encoding="utf-8")
+    write_atomically(folder / CAPTURES_FILE, _toml(captures, entries))
     if truth is not None:
-        (folder / TRUTH_FILE).write_text(_truth_json(truth), encoding="utf-8")
-
-
-_CONTENT = {"file": "radiance", "variance_file": "variance"}
+        write_atomically(folder / TRUTH_FILE, _truth_json(truth))
 
 
 def _toml(captures: CaptureSet, entries: list[dict[str, Any]]) -> str:

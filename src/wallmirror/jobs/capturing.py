@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from wallmirror.brdf import AngleSumBRDF, tabulate
-from wallmirror.captures import CaptureSet, Truth, write_captures
+from wallmirror.captures import CaptureSet, Truth
+from wallmirror.captures.unfinished import UnfinishedSet, unfinished_settings
+from wallmirror.captures.writing import require_replaceable
 from wallmirror.console import Advance
-from wallmirror.pathtracing.filming import render_captures
-from wallmirror.planning import CapturePlan
+from wallmirror.errors import InputError
+from wallmirror.pathtracing.filming import Store, render_captures
+from wallmirror.planning import CapturePlan, Sampling, Term
 from wallmirror.scene import Scene
 
 _TRUTH_NODES = 7201
@@ -27,9 +34,14 @@ def capture_scene(
     max_depth: int | None = None,
     plan: CapturePlan | None = None,
     variant: str = "llvm_ad_mono",
+    restart: bool = False,
     progress: Advance | None = None,
 ) -> CaptureSet:
     """Render every view of every realisation of a scene and write them as a capture set with its truth.
+
+    A run that was cut short, even by a kill, goes on where it was when the same is asked again: finished captures are
+    kept beside the folder (`wallmirror.captures.unfinished`), and the set takes its place once all are there. The
+    result is then the same to the bit as without the interruption, as far as a render repeats itself (`Renderer`).
 
     Parameters
     ----------
@@ -41,20 +53,69 @@ def capture_scene(
         Sampler, samples, seeds, depth and BRDF table of `advise`. Samples that are given are independent ones.
     seed:
         Root of all random numbers.
+    restart:
+        Throw away what an unfinished run left.
+
+    Returns
+    -------
+    The captures as they are stored: float32, before `read_captures` adds the variance of that rounding.
 
     Raises
     ------
     InputError
-        If the folder holds something else, or the scene cannot be rendered.
+        If the folder holds something else or cannot be written, the scene cannot be rendered, or an unfinished run
+        with other settings left captures.
     """
-    if plan is None:
-        captures = render_captures(scene, spp=spp, seed=seed, max_depth=max_depth, variant=variant, progress=progress)
-    else:
-        captures = film_as_planned(
-            scene, plan, spp=spp, seed=seed, max_depth=max_depth, variant=variant, progress=progress
-        )
-    write_captures(out, captures, settings=dict(captures.provenance), truth=truth_of(scene))
+    require_replaceable(out.resolve())
+    stores: list[UnfinishedSet] = []
+
+    def open_store(provenance: dict[str, str]) -> UnfinishedSet:
+        settings: dict[str, Any] = {**provenance, "scene_sha256": fingerprint(scene)}
+        if plan is not None:
+            settings["plan"] = json.loads(json.dumps(asdict(plan)))
+        stores.append(UnfinishedSet(out, settings, restart=restart))
+        return stores[-1]
+
+    try:
+        if plan is None:
+            captures = render_captures(
+                scene,
+                spp=spp,
+                seed=seed,
+                max_depth=max_depth,
+                variant=variant,
+                progress=progress,
+                open_store=open_store,
+            )
+        else:
+            captures = film_as_planned(
+                scene,
+                plan,
+                spp=spp,
+                seed=seed,
+                max_depth=max_depth,
+                variant=variant,
+                progress=progress,
+                open_store=open_store,
+            )
+        stores[-1].finish(captures, truth_of(scene))
+    finally:
+        for store in stores:
+            store.close()
     return captures
+
+
+def planned_before(scene: Scene, out: Path, tolerance: float) -> CapturePlan | None:
+    """The plan of an unfinished capture of this scene to this tolerance: plans rest on timings and differ each time."""
+    settings = unfinished_settings(out) or {}
+    try:
+        plan = dict(settings["plan"])
+        plan["sampling"] = Sampling(**plan["sampling"])
+        plan["terms"] = tuple(Term(**term) for term in plan["terms"])
+        found = CapturePlan(**plan)
+    except (KeyError, TypeError):
+        return None
+    return found if found.tolerance == tolerance and settings.get("scene_sha256") == fingerprint(scene) else None
 
 
 def film_as_planned(
@@ -66,6 +127,7 @@ def film_as_planned(
     max_depth: int | None = None,
     variant: str = "llvm_ad_mono",
     progress: Advance | None = None,
+    open_store: Callable[[dict[str, str]], Store] | None = None,
 ) -> CaptureSet:
     """Render a capture set with a plan's settings, as far as no explicit one beats them."""
     sampling, brdf = plan.sampling, scene.wall.brdf
@@ -82,12 +144,31 @@ def film_as_planned(
         rr_depth=plan.rr_depth if max_depth is None else None,
         variant=variant,
         progress=progress,
+        open_store=open_store,
     )
     if not whole:
         return captures
     # What was promised goes with the films, as far as they are what was planned.
     promise = {"tolerance": f"{plan.tolerance:g}", "predicted_error": f"{plan.error:.3g}"}
     return replace(captures, provenance={**captures.provenance, **promise})
+
+
+def fingerprint(scene: Scene) -> str:
+    """A checksum of all that a scene's films depend on: everything but its texts."""
+    return hashlib.sha256(repr(_plain(replace(scene, title="", about=""))).encode()).hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    """A value as nested tuples of numbers and texts, whose repr tells different ones apart."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return type(value).__name__, *((f.name, _plain(getattr(value, f.name))) for f in fields(value))
+    if isinstance(value, np.ndarray):
+        return value.shape, hashlib.sha256(np.ascontiguousarray(value).data).hexdigest()
+    if isinstance(value, tuple | list):
+        return tuple(_plain(entry) for entry in value)
+    if isinstance(value, bool | int | float | str | None):
+        return value
+    raise InputError(f"holds a {type(value).__name__}, which no scene file can hold", field="scene")
 
 
 def truth_of(scene: Scene) -> Truth:

@@ -144,6 +144,7 @@ def _run(scene: Scene, depth: int, out: Path, size: Size, seed: int, runtime: Ru
             seed=seed,
             max_depth=depth,
             variant=runtime.variant,
+            restart=True,
             progress=advance,
         )
     with stage(f"solving {scene.name}, {_bounces(depth)}"):

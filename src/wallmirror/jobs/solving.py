@@ -19,8 +19,8 @@ from wallmirror.derendering.calibration import Calibration, calibrate
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.solution import Solution
 from wallmirror.derendering.solve import SolveOptions, solve
-from wallmirror.files import write_atomically
-from wallmirror.report import FigureBlock, Section, TableBlock, Verdict, write_page
+from wallmirror.files import write_together
+from wallmirror.report import FigureBlock, Section, TableBlock, Verdict, page_html
 from wallmirror.report.figures import recovered_brdf, recovered_source, scene_plan, source_deviations
 
 Array = NDArray[np.float64]
@@ -106,7 +106,7 @@ def solve_directory(
     Parameters
     ----------
     directory, out:
-        The capture set, and the folder to write to; earlier results there are replaced file by file.
+        The capture set, and the folder to write to; earlier results there are replaced together.
     calibrated:
         Find the card's offset, distance and width from the captures first (`calibrate`).
     progress, options:
@@ -155,12 +155,9 @@ def true_brdf(solution: Solution, truth: Truth | None) -> Array | None:
 
 
 def write_solution(out: Path, solved: Solved) -> None:
-    """Write a solution's files and its report page into a folder."""
+    """Write a solution's files and its report page into a folder, all or none of them."""
     solution = solved.solution
-    write_atomically(out / "source.csv", _source_csv(solution))
-    write_atomically(out / "brdf.csv", _brdf_csv(solution))
-    write_page(
-        out / "report.html",
+    page = page_html(
         title="A wall turned into a mirror",
         lead=solution.status,
         verdicts=verdicts(solved),
@@ -180,9 +177,17 @@ def write_solution(out: Path, solved: Solved) -> None:
             *solution_sections(solved),
         ],
     )
-    # Last, so that its presence says that the rest is complete.
     document = json.dumps(solved.summary(), indent=2, allow_nan=False)
-    write_atomically(out / "solution.json", document + "\n")
+    write_together(
+        out,
+        {
+            "source.csv": _source_csv(solution),
+            "brdf.csv": _brdf_csv(solution),
+            "report.html": page,
+            # Last, so that its presence says that the rest is complete.
+            "solution.json": document + "\n",
+        },
+    )
 
 
 def verdicts(solved: Solved) -> list[Verdict]:

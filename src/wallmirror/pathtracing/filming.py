@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from wallmirror.captures import CaptureSet
 from wallmirror.memory import film_bytes, require_memory, transport_bytes
@@ -21,6 +22,18 @@ _NEIGHBOURS = 5
 _PRIOR_SEEDS = 20
 
 
+class Store(Protocol):
+    """Where captures are kept as they come, such as `wallmirror.captures.unfinished.UnfinishedSet`."""
+
+    def load(self, view: int, realisation: int) -> tuple[NDArray[Any], NDArray[Any]] | None:
+        """Radiance and variance of a capture that is there, shape (N,) each."""
+
+    def save(
+        self, view: int, realisation: int, radiance: ArrayLike, variance: ArrayLike
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Keep a capture; what comes back is what was kept."""
+
+
 def render_captures(
     scene: Scene,
     *,
@@ -32,6 +45,7 @@ def render_captures(
     seeds: int = 1,
     variant: str = "llvm_ad_mono",
     progress: Progress | None = None,
+    open_store: Callable[[dict[str, str]], Store] | None = None,
 ) -> CaptureSet:
     """Render each view of each realisation on its own, with random numbers of its own.
 
@@ -46,11 +60,13 @@ def render_captures(
         whose scatter, steadied by that of the neighbouring pixels, their variance is known.
     progress:
         Called with (captures done, captures in all).
+    open_store:
+        Given the provenance, makes the place where captures are kept; those that are there are not rendered again.
 
     Returns
     -------
     Radiance and variance, both (A, N, B), with the geometry; the variance is that of `Render.moment_variance` for
-    independent samples.
+    independent samples. With a store they are what it keeps.
 
     Raises
     ------
@@ -68,40 +84,46 @@ def render_captures(
     max_depth = settings.max_depth if max_depth is None else max_depth
     rr_depth = settings.rr_depth if rr_depth is None else rr_depth
     radiance, variance = np.empty((2, views, pixels, realisations))
+    runtime = renderer.runtime
+    provenance = {
+        "scene": scene.name,
+        "renderer": f"mitsuba {runtime.mitsuba_version} {runtime.variant}",
+        "spp": str(spp * seeds),
+        **({} if sampler == "independent" else {"sampler": sampler}),
+        **({} if seeds == 1 else {"seeds": str(seeds)}),
+        "max_depth": str(max_depth),
+        "rr_depth": str(rr_depth),
+        "seed": str(seed),
+    }
+    store = None if open_store is None else open_store(provenance)
     roots = spread_seeds(seed, views * realisations * seeds)
     for done in range(views * realisations):
         view, realisation = divmod(done, realisations)
-        render = renderer.render(
-            view,
-            scene.source[:, realisation],
-            spp=spp,
-            seeds=roots[done * seeds : (done + 1) * seeds],
-            max_depth=max_depth,
-            rr_depth=rr_depth,
-            sampler=sampler,
-        )
-        radiance[view, :, realisation] = render.mean
-        known = render.method == "moments"
-        variance[view, :, realisation] = render.variance if known else steadied(render.variance, seeds)
+        kept = None if store is None else store.load(view, realisation)
+        if kept is None:
+            render = renderer.render(
+                view,
+                scene.source[:, realisation],
+                spp=spp,
+                seeds=roots[done * seeds : (done + 1) * seeds],
+                max_depth=max_depth,
+                rr_depth=rr_depth,
+                sampler=sampler,
+            )
+            known = render.method == "moments"
+            kept = render.mean, render.variance if known else steadied(render.variance, seeds)
+            if store is not None:
+                kept = store.save(view, realisation, *kept)
+        radiance[view, :, realisation], variance[view, :, realisation] = kept
         if progress is not None:
             progress(done + 1, views * realisations)
-    runtime = renderer.runtime
     return CaptureSet(
         observer=scene.observer,
         card=scene.card,
         room=scene.room,
         radiance=radiance,
         variance=variance,
-        provenance={
-            "scene": scene.name,
-            "renderer": f"mitsuba {runtime.mitsuba_version} {runtime.variant}",
-            "spp": str(spp * seeds),
-            **({} if sampler == "independent" else {"sampler": sampler}),
-            **({} if seeds == 1 else {"seeds": str(seeds)}),
-            "max_depth": str(max_depth),
-            "rr_depth": str(rr_depth),
-            "seed": str(seed),
-        },
+        provenance=provenance,
     )
 
 

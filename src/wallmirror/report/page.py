@@ -53,6 +53,11 @@ class Section:
 
 def write_page(path: Path, *, title: str, lead: str, verdicts: list[Verdict], sections: list[Section]) -> None:
     """Write the page as a whole, or leave the earlier one."""
+    write_atomically(path, page_html(title=title, lead=lead, verdicts=verdicts, sections=sections))
+
+
+def page_html(*, title: str, lead: str, verdicts: list[Verdict], sections: list[Section]) -> str:
+    """The page as HTML."""
     contents = "".join(
         f'<li><a href="#s{number}">{escape(section.title)}</a></li>' for number, section in enumerate(sections, 1)
     )
@@ -60,9 +65,7 @@ def write_page(path: Path, *, title: str, lead: str, verdicts: list[Verdict], se
         f'<section id="s{number}"><h2>{escape(section.title)}</h2>{"".join(map(_block, section.blocks))}</section>'
         for number, section in enumerate(sections, 1)
     )
-    write_atomically(
-        path,
-        f"""<!doctype html>
+    return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{escape(title)}</title><style>{_STYLE}</style></head>
 <body><main><h1>{escape(title)}</h1><p class="lead">{_text(lead)}</p>
@@ -70,8 +73,7 @@ def write_page(path: Path, *, title: str, lead: str, verdicts: list[Verdict], se
 <nav><ol>{contents}</ol></nav>
 {body}
 <footer>{escape(_footer())}</footer></main></body></html>
-""",
-    )
+"""
 
 
 def _text(text: str) -> str:
