@@ -10,7 +10,8 @@ import numpy as np
 
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.estimate import Estimate
-from wallmirror.derendering.noisy import NOISY_STEPS, refine, require_patterns
+from wallmirror.derendering.knots import NOISY_STEPS, refine
+from wallmirror.derendering.noisy import require_patterns
 from wallmirror.derendering.poisson import maximise_poisson, poisson_bound
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.subspace import SignalSpace

@@ -15,7 +15,7 @@ from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, noise_edge, signal_space, space_within
 from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card
-from wallmirror.transport import build_kernel
+from wallmirror.transport import Kernel, build_kernel
 
 Array = NDArray[np.float64]
 
@@ -84,19 +84,34 @@ class Problem:
         """T_1 .. T_M with weighted rows."""
         if self.inverse_variance is None:
             return designs
-        return [sp.csr_array(t.multiply(self.row_weights)) for t in designs]
+        weights = self.row_weights[:, 0]
+        return [
+            sp.csr_array((t.data * np.repeat(weights, np.diff(t.indptr)), t.indices, t.indptr), t.shape)
+            for t in designs
+        ]
 
-    def designs(self, step_deg: float, *, degree: int, tolerance: float) -> tuple[SplineGrid, list[sp.csr_array]]:
-        """The spline grid of one knot spacing and the transport over it, with quadrature to match."""
-        step = math.radians(step_deg)
-        kernel = build_kernel(
+    @cached_property
+    def fit_weights(self) -> Array:
+        """w of the misfit sum w (D - F V)^2: shape (P, B), or (P, 1) where all realisations share them."""
+        if self.inverse_variance is None:
+            return np.ones((self.data.shape[0], 1))
+        first = self.inverse_variance[:, :1]
+        return first if np.all(self.inverse_variance == first) else self.inverse_variance
+
+    def kernel(self, step_deg: float, tolerance: float) -> Kernel:
+        """The transport's kernel with a quadrature to match one knot spacing."""
+        return build_kernel(
             self.captures.observer,
             self.captures.card,
             weights=self.captures.transport,
-            resolution=2 * step,
+            resolution=2 * math.radians(step_deg),
             tolerance=tolerance,
         )
-        grid = grid_for(kernel, step=step, degree=degree)
+
+    def designs(self, step_deg: float, *, degree: int, tolerance: float) -> tuple[SplineGrid, list[sp.csr_array]]:
+        """The spline grid of one knot spacing and the transport over it, with quadrature to match."""
+        kernel = self.kernel(step_deg, tolerance)
+        grid = grid_for(kernel, step=math.radians(step_deg), degree=degree)
         return grid, design_matrices(kernel, grid)
 
 

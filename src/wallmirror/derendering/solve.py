@@ -17,7 +17,8 @@ from threadpoolctl import threadpool_limits
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.counting import solve_counts, with_counting_noise
 from wallmirror.derendering.exact import solve_exactly
-from wallmirror.derendering.noisy import NOISY_STEPS, solve_noisy
+from wallmirror.derendering.knots import NOISY_STEPS
+from wallmirror.derendering.noisy import solve_noisy
 from wallmirror.derendering.one_bounce import check_one_bounce
 from wallmirror.derendering.problem import Problem, expected_mismatch, prepare
 from wallmirror.derendering.scarce import solve_scarce

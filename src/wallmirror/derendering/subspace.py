@@ -18,6 +18,7 @@ import scipy.linalg as sl
 import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 Array = NDArray[np.float64]
 
@@ -133,12 +134,12 @@ def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noi
         Its standard deviation; None to estimate it from what the projection takes away.
     """
     span = sp.csc_array(sp.hstack(designs))
-    gram = (span.T @ span).toarray()
-    values, vectors = np.linalg.eigh(gram)
-    kept = values > 1e-10 * values[-1]
-    whitened = vectors[:, kept] / np.sqrt(values[kept])
-    projected = whitened.T @ (span.T @ data)  # coordinates in an orthonormal basis of the span
-    dimensions = int(np.count_nonzero(kept))
+    # Pivoted Cholesky of the Gram matrix: the columns that span, best first, and the triangle that makes them orthonormal.
+    factor, pivots, dimensions, _ = lapack.dpstrf((span.T @ span).toarray(), lower=True, tol=-1.0)
+    strength = np.diag(factor)[:dimensions]
+    dimensions = int(np.count_nonzero(strength * strength > 1e-10 * strength[0] * strength[0]))
+    span, triangle = span[:, pivots[:dimensions] - 1], factor[:dimensions, :dimensions]
+    projected = sl.solve_triangular(triangle, span.T @ data, lower=True, check_finite=False)
     left, singular, _ = np.linalg.svd(projected, full_matrices=False)
     if noise is None:
         rest = max(0.0, float(np.sum(data * data) - np.sum(projected * projected)))
@@ -147,10 +148,13 @@ def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noi
     # The span's weakest directions are known to the root of what was kept of them, no better.
     rounding = 1e-7 * singular[0]
     rank = int(np.count_nonzero(singular[:elements] > max(rounding, floor)))
-    return SignalSpace(span @ (whitened @ left[:, :elements]), singular, rank, dimensions)
+    within = sl.solve_triangular(triangle, left[:, :elements], lower=True, trans="T", check_finite=False)
+    return SignalSpace(span @ within, singular, rank, dimensions)
 
 
-def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) -> ClosedForm:
+def closed_form(
+    data: Array, designs: list[sp.csr_array], space: SignalSpace, *, band: Array | None = None
+) -> ClosedForm:
     """Recover r, F and V from data whose rank is M: minimise sum_i |(I - U U^T) T_i r|^2.
 
     Parameters
@@ -161,6 +165,8 @@ def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) ->
         T_1 .. T_M, each (P, K).
     space:
         `signal_space(data, M)` with rank M.
+    band:
+        `banded_gram(designs)` where it is known already.
 
     Notes
     -----
@@ -170,7 +176,7 @@ def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) ->
     u = space.basis
     size = designs[0].shape[1]
     stacked = np.concatenate([(t.T @ u).T for t in designs])  # H, (M^2, K); rows i*M..i*M+M-1 belong to T_i
-    band = banded_gram(designs)
+    band = banded_gram(designs) if band is None else band
     factor = _banded_cholesky(band)
     values, leading = _leading_pairs(stacked, factor, len(designs))
     r = sl.cho_solve_banded((factor, True), stacked.T @ leading)

@@ -234,7 +234,8 @@ def recovered_brdf(solution: Solution, truth: Array | None = None) -> Figure:
         scale = float(np.nansum(rho * truth)) / power if power else 1.0
         axes.plot(u, scale * truth, color=TRUTH, linewidth=3.2, alpha=0.25, label="true")
     axes.plot(u, rho, color=OURS, linewidth=1.2, label="recovered")
-    axes.set_xlim(float(u[seen].min()), float(u[seen].max()))
+    shown = u[seen] if np.count_nonzero(seen) > 1 else u
+    axes.set_xlim(float(shown.min()), float(shown.max()))
     axes.set_ylim(-0.06, 1.12)
     axes.set_xlabel("angle sum θs + θo (degrees); 0 is the mirror direction")
     axes.set_ylabel("BRDF / peak")
