@@ -71,6 +71,10 @@ class ClosedForm:
         Number of orthogonal BRDFs that explain the data as well as the best within a factor of 100, and to 1 %.
     exposure:
         How well each coefficient is seen, 1 for the best-seen, shape (K,).
+    family:
+        Those near solutions, each with |T r| = 1 and orthogonal to the others over all entries of F, shape (K, n).
+    beyond:
+        1 - lambda_(n+1): how far the best BRDF outside the family is from explaining the data.
     """
 
     coefficients: Array
@@ -80,6 +84,8 @@ class ClosedForm:
     gap: float
     near_solutions: int
     exposure: Array
+    family: Array
+    beyond: float
 
     @property
     def error(self) -> float:
@@ -178,8 +184,8 @@ def closed_form(
     stacked = np.concatenate([(t.T @ u).T for t in designs])  # H, (M^2, K); rows i*M..i*M+M-1 belong to T_i
     band = banded_gram(designs) if band is None else band
     factor = _banded_cholesky(band)
-    values, leading = _leading_pairs(stacked, factor, len(designs))
-    r = sl.cho_solve_banded((factor, True), stacked.T @ leading)
+    values, vectors = _leading_pairs(stacked, factor, len(designs))
+    r = sl.cho_solve_banded((factor, True), stacked.T @ vectors[:, 0])
     projected = (stacked @ r).reshape(len(designs), -1).T  # W, (M, M): column i is U^T T_i r
     norm, missed = 0.0, 0.0
     for i, t in enumerate(designs):
@@ -195,15 +201,18 @@ def closed_form(
         scale, source = -scale, -source
     lost = 1 - values
     # A rival explains the data nearly as well; one that misses more than a hundredth of them is none, however noisy they are.
-    near = int(np.count_nonzero(lost < min(100 * max(mismatch, 1e-15 * size), _NO_RIVAL)))
+    near = max(1, int(np.count_nonzero(lost < min(100 * max(mismatch, 1e-15 * size), _NO_RIVAL))))
+    family = sl.cho_solve_banded((factor, True), stacked.T @ vectors[:, :near]) if near > 1 else r[:, None] * scale
     return ClosedForm(
         coefficients=r * scale,
         transport=(u @ projected) * scale,
         source=source,
         mismatch=mismatch,
         gap=float(lost[1]) if lost.size > 1 else 1.0,
-        near_solutions=max(1, near),
+        near_solutions=near,
         exposure=band[0] / max(float(band[0].max()), 1e-300),
+        family=family,
+        beyond=float(lost[near]) if lost.size > near else 1.0,
     )
 
 
@@ -254,7 +263,7 @@ def _banded_cholesky(band: Array) -> Array:
 
 
 def _leading_pairs(stacked: Array, factor: Array, elements: int) -> tuple[Array, Array]:
-    """Eigenvalues of H A^-1 H^T, descending (all of them, or the first four), and the first eigenvector."""
+    """Eigenvalues of H A^-1 H^T, descending, and their eigenvectors: all of them, or the first four."""
 
     def apply(x: Any) -> Array:
         return np.asarray(stacked @ sl.cho_solve_banded((factor, True), stacked.T @ x), dtype=np.float64)
@@ -263,9 +272,9 @@ def _leading_pairs(stacked: Array, factor: Array, elements: int) -> tuple[Array,
     if elements <= _DENSE_ELEMENTS:
         matrix = apply(np.eye(n))
         values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-        return values[::-1], vectors[:, -1]
+        return values[::-1], vectors[:, ::-1]
     operator = spl.LinearOperator((n, n), matvec=apply, dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(n)
     values, vectors = spl.eigsh(operator, k=4, which="LA", v0=start, tol=1e-14)
     order = np.argsort(values)[::-1]
-    return values[order], vectors[:, order[0]]
+    return values[order], vectors[:, order]

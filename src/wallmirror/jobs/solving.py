@@ -28,14 +28,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Judgement:
-    """Errors against a known truth, after the best global scale.
+    """Errors against a known truth, after the best global scale (or the best one of each group, where there are several).
 
     Parameters
     ----------
     source_error:
         Relative error of the pattern, to compare with the solution's predicted_error.
     brdf_error:
-        Relative error of the BRDF over the angle sums known to 5 % of the peak; nan where the truth has no finite values.
+        Relative error of the BRDF over the angle sums known to 5 % of the peak; nan where the truth has no finite values,
+        or the BRDF's parts have scales of their own.
     """
 
     source_error: float
@@ -135,10 +136,10 @@ def judge(solution: Solution, truth: Truth | None) -> Judgement | None:
         return None
     rho = true_brdf(solution, truth)
     brdf_error = math.nan
-    if rho is not None:
+    if rho is not None and solution.components == 1:
         seen = well_seen(solution)
         brdf_error = scale_free_error(solution.brdf[seen], rho[seen])
-    return Judgement(scale_free_error(solution.source, truth.source), brdf_error)
+    return Judgement(scale_free_error(solution.source, truth.source, solution.groups), brdf_error)
 
 
 def well_seen(solution: Solution) -> NDArray[np.bool_]:
