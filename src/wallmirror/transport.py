@@ -15,6 +15,7 @@ applies it to a known BRDF. The weight G is
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from dataclasses import dataclass
@@ -281,7 +282,7 @@ def quadrature_order(width: float, tolerance: float) -> int:
     offsets = np.linspace(0.0, width / 2 + 4.0, 33 + int(2 * width))
     reference = _lobe_average(width, offsets)
     for order in range(1 + int(width / 4), _MAX_ORDER + 1):  # nodes further apart than the lobe's width see nothing
-        nodes, weights = np.polynomial.legendre.leggauss(order)
+        nodes, weights = _gauss_legendre(order)
         values = np.exp(-0.5 * (offsets[:, None] + 0.5 * width * nodes) ** 2) @ (0.5 * weights)
         if np.max(np.abs(values - reference)) <= tolerance:
             return order
@@ -290,6 +291,15 @@ def quadrature_order(width: float, tolerance: float) -> int:
         f"to {tolerance:g}; narrow the strips, use more pixels or accept a larger tolerance",
         field="card.element_width",
     )
+
+
+@functools.cache
+def _gauss_legendre(order: int) -> tuple[Array, Array]:
+    """Nodes and weights on [-1, 1], kept: a search for the card asks for the same ones hundreds of times."""
+    nodes, weights = np.polynomial.legendre.leggauss(order)
+    nodes.setflags(write=False)
+    weights.setflags(write=False)
+    return nodes, weights
 
 
 def _lobe_average(width: float, offsets: Array) -> Array:
@@ -329,8 +339,8 @@ def _kernel(
     along_strip: int,
 ) -> Kernel:
     """Nodes q = (across the pixel, across the strip); the height of the pixel is summed into the weight."""
-    pixel_nodes, pixel_weights = np.polynomial.legendre.leggauss(along_pixel)
-    strip_nodes, strip_weights = np.polynomial.legendre.leggauss(along_strip)
+    pixel_nodes, pixel_weights = _gauss_legendre(along_pixel)
+    strip_nodes, strip_weights = _gauss_legendre(along_strip)
     t = pixel_tangents(observer)[:, None] + half_pixel * pixel_nodes
     # Axes: (A, N, M, pixel node, strip node).
     wall_x = wall_points(observer, t)[:, :, None, :, None]

@@ -114,15 +114,20 @@ def bound_of(
         raised[np.diag_indices_from(raised)] += ridge
         return np.asarray(sl.cholesky(raised, lower=True, overwrite_a=True, check_finite=False))
 
-    lower = factor(ridge)
+    lower, sound = None, lost <= 1e-3
+    while lower is None:
+        try:
+            lower = factor(ridge)
+        except np.linalg.LinAlgError:  # rounding took more than it should: what is left is no bound
+            ridge, sound = 100 * max(ridge, 1e-290), False
     covariance = _inverse(lower) - np.outer(scale, scale)
     spread = (rows @ covariance).reshape(coupled.shape)
     error = _scale_free_error(source, inverse, coupled, spread)
     # What the ridge alone holds, nothing holds: a bound on V that falls with it is none.
-    if lost <= 1e-3:
+    if sound:
         solved = sl.cho_solve((factor(10 * ridge), True), rows.T, check_finite=False).T - np.outer(rows @ scale, scale)
-        held = _scale_free_error(source, inverse, coupled, solved.reshape(coupled.shape)) < 0.8 * error
-    if lost > 1e-3 or held:
+        sound = _scale_free_error(source, inverse, coupled, solved.reshape(coupled.shape)) >= 0.8 * error
+    if not sound:
         error = float("inf")
     variance = np.einsum("bii->bi", inverse) + np.sum(spread * coupled, axis=-1)
     return Bound(

@@ -124,7 +124,7 @@ def solve_directory(
     if calibrated:
         calibration = calibrate(captures, progress=progress)
         captures = replace(captures, card=calibration.card)
-    solution = solve(captures, progress=progress, **options)
+    solution = solve(captures, calibration=calibration, progress=progress, **options)
     solved = Solved(captures, solution, truth, judge(solution, truth), calibration, options.get("tolerance"))
     write_solution(out, solved)
     return solved
@@ -266,7 +266,13 @@ def certificates(solved: Solved) -> TableBlock:
     if solved.calibration is not None:
         found = solved.calibration
         for name, value in found.values.items():
-            rows.append((f"the card's {name}, found", f"{value:.6g} m", f"± {found.std[name]:.1e} m; held fixed above"))
+            rows.append(
+                (
+                    f"the card's {name}, found",
+                    f"{value:.6g} m",
+                    f"± {found.std[name]:.1e} m, which the error bars know of",
+                )
+            )
     if s.one_bounce is not None:
         check = s.one_bounce
         rows.append(
