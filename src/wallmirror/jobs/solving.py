@@ -158,7 +158,7 @@ def true_brdf(solution: Solution, truth: Truth | None) -> Array | None:
 def write_solution(out: Path, solved: Solved) -> None:
     """Write a solution's files and its report page into a folder."""
     solution = solved.solution
-    write_atomically(out / "source.csv", _source_csv(solution))
+    write_atomically(out / "source.csv", source_csv(solution.source, solution.source_std))
     write_atomically(out / "brdf.csv", _brdf_csv(solution))
     write_page(
         out / "report.html",
@@ -219,7 +219,8 @@ def solution_sections(solved: Solved) -> list[Section]:
                 "Each dot is one element of the card in one realisation of the pattern. Only ratios can be recovered: a "
                 "brighter card before a darker wall sends back the same light.",
                 FigureBlock(
-                    recovered_source(solution, source_truth), f"The recovered pattern with error bars{beside}."
+                    recovered_source(solution.source, solution.shape_std, source_truth),
+                    f"The recovered pattern with error bars{beside}.",
                 ),
                 *(
                     ()
@@ -298,7 +299,8 @@ def _number(value: float) -> str:
     return "noise not stated" if math.isnan(value) else f"{value:.3f}"
 
 
-def _csv(header: list[str], rows: list[list[float]]) -> str:
+def csv_text(header: list[str], rows: list[list[float]]) -> str:
+    """A table as CSV."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
@@ -306,14 +308,13 @@ def _csv(header: list[str], rows: list[list[float]]) -> str:
     return text.getvalue()
 
 
-def _source_csv(solution: Solution) -> str:
-    elements, realisations = solution.source.shape
-    rows = [
-        [i, b, solution.source[i, b], solution.source_std[i, b]] for b in range(realisations) for i in range(elements)
-    ]
-    return _csv(["element", "realisation", "radiance", "standard_deviation"], rows)
+def source_csv(source: Array, std: Array) -> str:
+    """A pattern (M, B) with its standard deviations, a row for each entry."""
+    elements, realisations = source.shape
+    rows = [[i, b, source[i, b], std[i, b]] for b in range(realisations) for i in range(elements)]
+    return csv_text(["element", "realisation", "radiance", "standard_deviation"], rows)
 
 
 def _brdf_csv(solution: Solution) -> str:
     rows = np.stack([np.degrees(solution.angle_sum), solution.brdf, solution.brdf_std], axis=1)
-    return _csv(["angle_sum_deg", "brdf", "standard_deviation"], rows.tolist())
+    return csv_text(["angle_sum_deg", "brdf", "standard_deviation"], rows.tolist())
