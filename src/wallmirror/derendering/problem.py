@@ -139,11 +139,8 @@ def prepare(
             "two elements of the card stand at the same place, so their light cannot be told apart; give each its "
             "own position"
         )
-    if realisations < elements and not few_captures:
-        raise UndeterminedError(
-            f"{realisations} realisation(s) of the pattern cannot determine {elements} elements; capture at least "
-            f"{elements} different patterns, or use the method for few captures"
-        )
+    if not few_captures:
+        require_realisations(realisations, elements)
     if views * pixels <= elements:
         raise UndeterminedError(
             f"{views * pixels} pixel(s) cannot determine {elements} elements and a BRDF; use more pixels or views"
@@ -169,6 +166,15 @@ def prepare(
     return problem, _signal_space(problem, weak_patterns=weak_patterns)
 
 
+def require_realisations(realisations: int, elements: int) -> None:
+    """Refuse fewer patterns than elements, for a solver that stands on their space."""
+    if realisations < elements:
+        raise UndeterminedError(
+            f"{realisations} realisation(s) of the pattern cannot determine {elements} elements; capture at least "
+            f"{elements} different patterns, or use the method for few captures"
+        )
+
+
 def _inverse_variance(variance: Array, scale: float) -> tuple[Array, NDArray[np.bool_]]:
     """Weights of the pixels in units of the scale, and which of them stated their noise."""
     finite = np.isfinite(variance)
@@ -187,8 +193,8 @@ def too_few_patterns(found: int, elements: int) -> UndeterminedError:
     )
 
 
-def _signal_space(problem: Problem, *, weak_patterns: bool) -> SignalSpace:
-    """The leading M directions, with the rank counted above the noise's largest singular value."""
+def patterns_space(problem: Problem) -> tuple[SignalSpace, float]:
+    """The leading M directions, with the rank counted above the noise's largest singular value, and that value."""
     rows, realisations = problem.data.shape
     elements = problem.card.elements
     floor = noise_edge(rows, realisations) if problem.noise_is_stated else 0.0
@@ -199,6 +205,13 @@ def _signal_space(problem: Problem, *, weak_patterns: bool) -> SignalSpace:
         floor = tail / max(0.5, 1 - math.sqrt(realisations / rows)) / math.sqrt(rows) * noise_edge(rows, realisations)
         rank = int(np.count_nonzero(space.singular_values[:elements] > floor))
         space = replace(space, rank=min(rank, space.rank))
+    return space, floor
+
+
+def _signal_space(problem: Problem, *, weak_patterns: bool) -> SignalSpace:
+    """The space of the patterns, of the films projected where they do not stand out of them as they are."""
+    elements = problem.card.elements
+    space, floor = patterns_space(problem)
     if space.rank == elements:
         return space
     certain = floor < _ROUNDING * space.singular_values[0]

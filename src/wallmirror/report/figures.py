@@ -264,7 +264,7 @@ def recovered_table(table: SplineTable) -> Figure:
             limit(float(np.degrees(low)), float(np.degrees(high)))
     axes.set_xlabel("outgoing angle θo (degrees)")
     axes.set_ylabel("incident angle θs (degrees)")
-    axes.legend(frameon=False, fontsize=9, loc="upper right")
+    axes.legend(fontsize=9, loc="upper right", framealpha=0.9)
     figure.colorbar(image, label="BRDF / peak")
     clean(axes)
     return figure
