@@ -5,6 +5,8 @@ functional c of r (here the BRDF's peak) removes it: with S the information of r
 
     Cov(r) = (S + k c c^T)^-1 - r r^T / (k (c r)^2),
     Cov(vec V) = blockdiag(H_b^-1) + [H_b^-1 C_b] Cov(r) [H_b^-1 C_b]^T.
+
+`foresight.foresee` takes it at a scene that is yet to be filmed, the solvers at what they found.
 """
 
 from __future__ import annotations

@@ -13,6 +13,9 @@ from wallmirror.derendering.subspace import ClosedForm
 
 Array = NDArray[np.float64]
 
+# A misfit beyond this many times the stated noise is no chance.
+_TOO_MUCH = 1.2
+
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
@@ -53,6 +56,19 @@ class Estimate:
     warnings: tuple[str, ...]
     priors: tuple[str, ...] = ()
     groups: tuple[tuple[int, ...], ...] = ()
+
+
+def doubts_of_fit(*, converged: bool, misfit: float | None) -> list[str]:
+    """What a fit's end and its misfit, in units of the stated noise variance, say against it; None where none is stated."""
+    doubts = []
+    if not converged:
+        doubts.append("the fit stopped before it converged, so the error bars may be too small")
+    if misfit is not None and misfit > _TOO_MUCH:
+        doubts.append(
+            f"the misfit is {misfit:.2f} times the stated noise, so the model (one bounce, angle-sum BRDF, geometry) or "
+            "the stated variances do not hold; the error bars were widened to match"
+        )
+    return doubts
 
 
 def scale_free_error(estimate: Array, truth: Array, groups: tuple[tuple[int, ...], ...] = ()) -> float:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from wallmirror.derendering.estimate import Estimate, scale_free_error
+from wallmirror.derendering.estimate import Estimate, doubts_of_fit, scale_free_error
 from wallmirror.derendering.knots import NOISY_STEPS, Refined, refine
 from wallmirror.derendering.problem import Problem, reduced_misfit, too_few_patterns
 from wallmirror.derendering.subspace import SignalSpace, noise_edge
@@ -58,7 +58,7 @@ def solve_noisy(
     require_patterns(problem, transport, fit.source, sigma)
     predicted = sigma * bound.source_error
     shape_std = sigma * bound.shape_std
-    warnings = []
+    warnings: list[str] = []
     if not stated and _still_falls(refined):
         # What is left is the spline's own error, which the bound knows nothing of.
         assert refined.before is not None
@@ -70,13 +70,7 @@ def solve_noisy(
                 "the misfit still falls with finer knots than the captures allow, so it is no noise; the error bars are how "
                 "far the pattern moved when the knots were last halved"
             )
-    if not fit.converged:
-        warnings.append("the fit stopped before it converged, so the error bars may be too small")
-    if stated and reduced > 1.2:
-        warnings.append(
-            f"the misfit is {reduced:.2f} times the stated noise, so the model (one bounce, angle-sum BRDF, geometry) or "
-            "the stated variances do not hold; the error bars were widened to match"
-        )
+    warnings += doubts_of_fit(converged=fit.converged, misfit=reduced if stated else None)
     if rival is not None:
         moved = scale_free_error(rival.source, level.free.source)
         if moved > _STEADY * predicted:
