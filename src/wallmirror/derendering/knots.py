@@ -42,6 +42,8 @@ _SETTLED = 0.25
 _FAR_OFF = 2.0
 _GAP = 1.0
 _START = 0.3
+# Share of the data that finer knots must leave over.
+_SPARE = 0.25
 # Share of the BRDF's largest coefficient above which one is lit, of the best-seen one's information above which that one
 # counts, and of lit coefficients up to which rho is sparse.
 _LIT = 0.01
@@ -114,6 +116,7 @@ class _Ladder:
     _summed: dict[int, Moments] = field(default_factory=dict)
     _bands: dict[int, Array] = field(default_factory=dict)
     _closed: dict[int, ClosedForm] = field(default_factory=dict)
+    _free: dict[int, Fit] = field(default_factory=dict)
     _bounded: dict[int, Fit] = field(default_factory=dict)
 
     @classmethod
@@ -165,15 +168,68 @@ class _Ladder:
         return self._bands[index]
 
     def bounded(self, index: int, free: Fit) -> Fit:
-        """The maximum within the bounds, from the free one."""
+        """The maximum within the bounds, from the free one, or from coarser knots where that leads nowhere near it."""
         if index not in self._bounded:
-            self._bounded[index] = _bounded(self.summed(index), free)
+            summed = self.summed(index)
+            # Clipping a start can throw it into the valley of another maximum, so the first start is the best rho >= 0 for
+            # the free maximum's pattern.
+            best = maximise(summed, best_nonnegative(summed, free.source))
+            for start in ("free", "coarser"):
+                if self.agrees(index, free, best):
+                    break
+                r = free.coefficients if start == "free" else self._from_coarser(index)
+                best = min(best, maximise(summed, r), key=lambda fit: fit.objective)
+            self._bounded[index] = best
         return self._bounded[index]
+
+    def agrees(self, index: int, free: Fit, bounded: Fit) -> bool:
+        """Whether the bounds cost what they do where the truth keeps them: about one unit of noise a coefficient, not more."""
+        summed = self.summed(index)
+        noise = free.objective / max(1, summed.observations - summed.size)
+        return bounded.objective <= free.objective + 3 * summed.size * noise
+
+    def _from_coarser(self, index: int) -> Array:
+        """The closed form's r on the coarsest knots, and on finer ones the maximum within the bounds of the coarser."""
+        if index == 0:
+            return self.closed(0).coefficients
+        if index - 1 not in self._free:
+            start = self.closed(index - 1).coefficients
+            self._free[index - 1] = maximise(self.summed(index - 1), start, nonnegative=False, tolerance=_ROUGH)
+        return self.refined(index - 1, self.bounded(index - 1, self._free[index - 1]).coefficients, index)
+
+    def as_fine_as_the_bounds_want(self, index: int, free: Fit) -> tuple[int, Fit]:
+        """These knots, or coarser ones with which the bounded fit is as good.
+
+        Light that the model does not know is followed by free fits on fine knots, with a rho below zero. Bounds do not
+        follow it, and then finer knots have nothing to say for themselves.
+        """
+        while index > 0:
+            fit = self.bounded(index, free)
+            if self.agrees(index, free, fit):
+                break
+            self._from_coarser(index)
+            coarser = self.bounded(index - 1, self._free[index - 1])
+            freedom = self.freedom(index)
+            price = worth(self.seen(index) - self.seen(index - 1), freedom) * self.variance(fit.objective, freedom)
+            if coarser.objective - fit.objective >= price:
+                break
+            index, free = index - 1, self._free[index - 1]
+        return index, free
+
+    def seen(self, index: int) -> int:
+        """How many coefficients the captures see."""
+        return int(np.count_nonzero(self.summed(index).seen))
 
     def freedom(self, index: int) -> int:
         """Data that are left over to tell the noise by."""
         summed = self.summed(index)
         return int(summed.observations - np.count_nonzero(summed.seen) - summed.cross.shape[0] * summed.elements)
+
+    def spare(self, index: int) -> float:
+        """Share of the data that as many coefficients as the grid has leave over; told before the grid's moments are made."""
+        known = next(iter(self._summed.values()))
+        unknown = self.grids[index].size + known.cross.shape[0] * known.elements
+        return float(1 - unknown / max(1, known.observations))
 
     def variance(self, objective: float, freedom: int) -> float:
         """Of the noise in units of the weights: 1 where it is stated, else what a misfit says."""
@@ -232,6 +288,8 @@ def refine(
         while fits:
             index = max(fits)
             free = fits.pop(index)
+            if nonnegative:
+                index, free = ladder.as_fine_as_the_bounds_want(index, free)
             level = _level(ladder, index, free, nonnegative)
             if level is not None:
                 before = fits[max(fits)] if fits else None
@@ -277,7 +335,9 @@ def _first_worth_a_fit(ladder: _Ladder) -> int:
     return 0
 
 
-def _climb(ladder: _Ladder, begin: int, nonnegative: bool, tell: Tell) -> tuple[dict[int, Fit], Other | None]:
+def _climb(
+    ladder: _Ladder, begin: int, nonnegative: bool, tolerance: float | None, tell: Tell
+) -> tuple[dict[int, Fit], Other | None]:
     """The free fits on the knots taken, by index, and what finer ones that were not would make of the last."""
 
     def fit(index: int, *starts: Array) -> Fit:
@@ -291,7 +351,7 @@ def _climb(ladder: _Ladder, begin: int, nonnegative: bool, tell: Tell) -> tuple[
     while index > 0:  # coarser ones may do
         coarser = fit(index - 1, ladder.coarsened(index, best.coefficients))
         freedom = ladder.freedom(index)
-        fewer = _seen(ladder, index) - _seen(ladder, index - 1)
+        fewer = ladder.seen(index) - ladder.seen(index - 1)
         if coarser.objective - best.objective >= worth(fewer, freedom) * ladder.variance(best.objective, freedom):
             break
         rival = Other(best.source, best.objective)
@@ -301,6 +361,8 @@ def _climb(ladder: _Ladder, begin: int, nonnegative: bool, tell: Tell) -> tuple[
         return fits, rival
     idle = 0
     for finer in range(index + 1, ladder.last + 1):
+        if ladder.spare(finer) < _SPARE:
+            break  # nearly as many coefficients as data follow whatever the model misses
         try:
             trial, other = _finer(ladder, index, best, finer, nonnegative, fit, tell)
         except UndeterminedError:
@@ -347,7 +409,7 @@ def _finer(
     if finer < ladder.last - 1:  # coarse still: to try is no dearer than to tell
         return _paying(ladder, index, best, finer, fit(finer, start))
     every = np.ones(start.size, dtype=bool)
-    found, price = _tested(ladder, index, best, finer, every, _seen(ladder, index), tell)
+    found, price = _tested(ladder, index, best, finer, every, ladder.seen(index), tell)
     if found.gain >= price:
         return _paying(ladder, index, best, finer, fit(finer, start + found.step, start))
     if nonnegative:
@@ -367,7 +429,7 @@ def _finer(
 def _paying(ladder: _Ladder, index: int, best: Fit, finer: int, trial: Fit) -> tuple[Fit | None, Other]:
     """The fit on finer knots if it explains more than noise would let it."""
     freedom = ladder.freedom(finer)
-    price = worth(_seen(ladder, finer) - _seen(ladder, index), freedom) * ladder.variance(trial.objective, freedom)
+    price = worth(ladder.seen(finer) - ladder.seen(index), freedom) * ladder.variance(trial.objective, freedom)
     return (trial if best.objective - trial.objective >= price else None), Other(trial.source, trial.objective)
 
 
@@ -390,30 +452,9 @@ def _tested(
     return found, price
 
 
-def _seen(ladder: _Ladder, index: int) -> int:
-    return int(np.count_nonzero(ladder.summed(index).seen))
-
-
 def _stepped(ladder: _Ladder, index: int, r: Array) -> Other:
     """Pattern and misfit at given coefficients, without a fit."""
     transport = np.stack([t @ r for t in ladder.designs(index)], axis=1)
     films = Films(ladder.problem.data, ladder.problem.fit_weights, transport, np.zeros((transport.shape[1], 1)))
     source = films.solved(films.data)
     return Other(source, Films(films.data, films.weights, transport, source).objective())
-
-
-def _bounded(summed: Moments, free: Fit) -> Fit:
-    """The best maximum within the bounds of those reached from the free one.
-
-    Clipping a start can throw it into the valley of another maximum, so the first start is the best rho >= 0 for the
-    free maximum's pattern. The free maximum also tells whether the bounds are reached well: where the truth keeps
-    them they cost about one unit of noise variance a coefficient, not more.
-    """
-    noise = free.objective / max(1, summed.observations - summed.size)
-    acceptable = free.objective + 3 * summed.size * noise
-    bounded: list[Fit] = []
-    for start in (best_nonnegative(summed, free.source), free.coefficients):
-        bounded.append(maximise(summed, start))
-        if bounded[-1].objective <= acceptable:
-            break
-    return min(bounded, key=lambda fit: fit.objective)
