@@ -1,6 +1,6 @@
 """Maximum likelihood with its knots chosen by the data: the method for captures with noise.
 
-The closed form is the start, the Cramer-Rao bound the error bars (Akaike 1974 chooses the knots). What the fit cannot
+The closed form is the start, the Cramer-Rao bound the error bars; a score test chooses the knots (`knots`). What the fit cannot
 vouch for it refuses: patterns that do not stand out of the noise that was found, and knots that nothing determines.
 """
 
