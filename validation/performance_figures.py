@@ -11,7 +11,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from performance_analysis import EXACT, FEW, OPTIONS, RECORDED, TEXT, best_order, errors, sweeps
+from performance_runs import EXACT, FEW, OPTIONS, RECORDED, TEXT, best_order, errors, sweeps
 from thesis_algorithm import Scene
 
 from wallmirror import CaptureSet, radiance, solve, wall_points

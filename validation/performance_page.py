@@ -7,8 +7,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from performance_analysis import EXACT, FEW, RECORDED, TEXT
 from performance_figures import NAMES, Row, crossed_figure, example, sweep_figure
+from performance_runs import EXACT, FEW, RECORDED, TEXT
 
 #: A relative error of the pattern below which it counts as recovered.
 RECOVERED = 1e-6

@@ -228,11 +228,23 @@ def capture(
 
 @app.command(epilog="Example: wallmirror solve out/box -o out/box_solved")
 def solve(
-    directory: Annotated[Path, typer.Argument(help="Folder with captures.toml and its EXR files.")],
+    context: typer.Context,
+    directories: Annotated[
+        list[Path], typer.Argument(metavar="DIRECTORY", help="Folder with captures.toml and its EXR files.")
+    ],
     out: Out = Path("out/solution"),
     method: Annotated[
         str, typer.Option(help="auto, closed_form, maximum_likelihood, few_captures or poisson.")
     ] = "auto",
+    general: Annotated[
+        bool,
+        typer.Option(
+            "--general", help="A BRDF of both angles, from a folder for each of several positions of the camera."
+        ),
+    ] = False,
+    reciprocal: Annotated[
+        bool, typer.Option("--reciprocal", help="General: the BRDF is the same with its angles exchanged.")
+    ] = False,
     nonnegative: Annotated[bool, typer.Option(help="Keep BRDF and pattern >= 0.")] = True,
     support_deg: Annotated[
         float | None, typer.Option(help="Few captures: the BRDF is 0 beyond this angle sum (degrees).")
@@ -263,8 +275,18 @@ def solve(
     from wallmirror.jobs.solving import solve_directory
 
     terminal = Terminal(as_json=as_json)
+    if general:
+        _solve_general(context, directories, out, reciprocal, step_deg, terminal)
+        return
+    if reciprocal:
+        raise InputError("has a meaning with --general alone; leave it out", field="reciprocal")
+    if len(directories) > 1:
+        raise InputError(
+            f"names {len(directories)} capture sets; one is solved at a time, or all together with --general",
+            field="directory",
+        )
     solved = solve_directory(
-        directory,
+        directories[0],
         out,
         calibrated=calibrate,
         progress=terminal.note,
@@ -293,6 +315,29 @@ def solve(
     terminal.say(f"open {out / 'report.html'}")
     terminal.document(solved.summary())
     raise typer.Exit(1 if solved.shortfall else 0)
+
+
+def _solve_general(
+    context: typer.Context,
+    directories: list[Path],
+    out: Path,
+    reciprocal: bool,
+    step_deg: float | None,
+    terminal: Terminal,
+) -> None:
+    from wallmirror.jobs.solving_general import solve_directories
+
+    meant = {"directories", "out", "general", "reciprocal", "step_deg", "as_json"}
+    for name in context.params:
+        given = context.get_parameter_source(name)
+        if name not in meant and given is not None and given.name == "COMMANDLINE":
+            raise InputError("has no meaning with --general; leave it out", field=name)
+    solved = solve_directories(directories, out, reciprocal=reciprocal, step_deg=step_deg, progress=terminal.note)
+    terminal.say(solved.solution.status)
+    if solved.source_error is not None:
+        terminal.say(f"against the known truth: the pattern is {100 * solved.source_error:.2g} % off")
+    terminal.say(f"open {out / 'report.html'}")
+    terminal.document(solved.summary())
 
 
 @app.command(epilog="Example: wallmirror figures 3.2 3.3 -o out/figures")

@@ -15,6 +15,7 @@ applies it to a known BRDF. The weight G is
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from dataclasses import dataclass, replace
@@ -291,7 +292,7 @@ def quadrature_order(width: float, tolerance: float) -> int:
     offsets = np.linspace(0.0, width / 2 + 4.0, 33 + int(2 * width))
     reference = _lobe_average(width, offsets)
     for order in range(1 + int(width / 4), _MAX_ORDER + 1):  # nodes further apart than the lobe's width see nothing
-        nodes, weights = np.polynomial.legendre.leggauss(order)
+        nodes, weights = _gauss_legendre(order)
         values = np.exp(-0.5 * (offsets[:, None] + 0.5 * width * nodes) ** 2) @ (0.5 * weights)
         if np.max(np.abs(values - reference)) <= tolerance:
             return order
@@ -300,6 +301,15 @@ def quadrature_order(width: float, tolerance: float) -> int:
         f"to {tolerance:g}; narrow the strips, use more pixels or accept a larger tolerance",
         field="card.element_width",
     )
+
+
+@functools.cache
+def _gauss_legendre(order: int) -> tuple[Array, Array]:
+    """Nodes and weights on [-1, 1], kept: a search for the card asks for the same ones hundreds of times."""
+    nodes, weights = np.polynomial.legendre.leggauss(order)
+    nodes.setflags(write=False)
+    weights.setflags(write=False)
+    return nodes, weights
 
 
 def _lobe_average(width: float, offsets: Array) -> Array:
@@ -412,8 +422,8 @@ class _Nodes:
 
     def _rule(self, orders: tuple[int, int]) -> tuple[Array, Array, Array]:
         """Offsets of the nodes across pixel (in tangents) and strip (in metres), and their weights, which sum to 1."""
-        pixel_nodes, pixel_weights = np.polynomial.legendre.leggauss(orders[0])
-        strip_nodes, strip_weights = np.polynomial.legendre.leggauss(orders[1])
+        pixel_nodes, pixel_weights = _gauss_legendre(orders[0])
+        strip_nodes, strip_weights = _gauss_legendre(orders[1])
         average = 0.5 * pixel_weights[:, None] * (0.5 * strip_weights)
         return self.half_pixel * pixel_nodes, self.half_strip * strip_nodes, average
 

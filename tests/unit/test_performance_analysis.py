@@ -20,7 +20,7 @@ FEW = {"exact": 3, "alpha 0.1": 3, "alpha 10": 2, "few captures": 1}
 def analysis():
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(_VALIDATION))
-        yield importlib.import_module("performance_analysis")
+        yield importlib.import_module("performance_runs")
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from wallmirror.brdf import AngleSumBRDF, AngleSumTable, Diffuse, directional_albedo
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.components import components
+from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.noisy import require_patterns
 from wallmirror.derendering.problem import Problem, prepare
 from wallmirror.derendering.solution import Solution
@@ -365,13 +366,66 @@ def test_known_levels_and_albedos_bring_back_the_absolute_pattern_and_brdf() -> 
 # -- groups with scales of their own ---------------------------------------------------------------------------
 
 
+def two_groups() -> tuple[Observer, Card]:
+    """A card 250 m wide at 50 m: its left elements see the wall at angle sums that its right ones do not."""
+    return thesis_observer(), Card(elements_x=tuple(np.linspace(-125, 125, 4)), y=-50.0)
+
+
+class UnevenLobes(AngleSumBRDF):
+    """Lobes of 5 deg, those of the left elements a third as high: the scale that nobody can tell from the films."""
+
+    def of_sum(self, u: Any) -> Array:
+        left, right = lobes(-80.0, -50.0, sigma_deg=5.0), lobes(60.0, 85.0, sigma_deg=5.0)
+        return np.asarray(left.of_sum(u) / 3 + right.of_sum(u))
+
+
+@pytest.mark.parametrize("method", ["closed_form", "auto"])
+def test_groups_that_share_no_angle_come_back_with_a_scale_each(method: Method) -> None:
+    observer, card = two_groups()
+    source = patterns(4, 20)
+    found = solve(film(observer, card, UnevenLobes(), source), method=method)
+    assert found.groups == ((0, 1), (2, 3))
+    assert found.components == 2
+    assert found.verdict == "doubtful"
+    assert "elements 1, 2; elements 3, 4 share no angle" in found.status
+    assert "one scale for each of 2 groups" in found.status
+    # As the closed form elsewhere: rounding over the family's own gap.
+    assert scale_free_error(found.source, source, found.groups) < 1e-9
+    assert scale_free_error(found.source, source, found.groups) < found.predicted_error < 1e-8
+    # The twin: told by one scale, the two are a factor of three apart.
+    assert scale_free_error(found.source, source) > 0.3
+    # Each group is in the scale in which its own part of rho peaks at 1, and F V is the films all the same.
+    for range_deg in ((-100, -20), (20, 100)):
+        inside = (np.degrees(found.angle_sum) > range_deg[0]) & (np.degrees(found.angle_sum) < range_deg[1])
+        assert np.max(found.brdf[inside & (found.brdf < 2)]) == pytest.approx(1.0, abs=1e-3)
+    assert found.residual < 1e-10
+    document = json.loads(found.to_json())
+    assert document["groups"] == [[0, 1], [2, 3]]
+    assert document["components"] == 2
+
+
+def test_elements_that_share_an_angle_are_one_group() -> None:
+    found = solve(film(thesis_observer(100, 6), thesis_card(3), lobes(sigma_deg=6.0), patterns(3, 8)))
+    assert found.groups == ((0, 1, 2),)
+    assert json.loads(found.to_json())["groups"] == [[0, 1, 2]]
+    assert "one global scale" in found.status
+
+
+def test_one_known_scale_does_not_settle_two() -> None:
+    observer, card = two_groups()
+    captures = film(observer, card, lobes(-80.0, -50.0, 60.0, 85.0, sigma_deg=5.0), patterns(4, 20))
+    message = assert_undetermined(lambda: solve(captures, scale="level", source_level=0.5))
+    assert "does not settle 2" in message
+
+
 @pytest.mark.parametrize("method", ["closed_form", "auto"])
 def test_elements_that_share_no_angle_are_named_in_the_refusal(method: Method) -> None:
     observer, card = far_apart()
     captures = film(observer, card, lobes(sigma_deg=5.0), patterns(2, 20))
     message = assert_undetermined(lambda: solve(captures, method=method))
+    # Two groups, and more than two scales: V[0] - c V[1] has a BRDF too.
     assert "element 1; element 2 share no angle" in message
-    assert "each group has a scale of its own" in message
+    assert "more than a scale each is free" in message
 
 
 def groups(brdf: AngleSumBRDF, *places: float, y: float = -50.0, observer: Observer | None = None) -> object:

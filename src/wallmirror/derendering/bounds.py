@@ -5,15 +5,19 @@ functional c of r (here the BRDF's peak) removes it: with S the information of r
 
     Cov(r) = (S + k c c^T)^-1 - r r^T / (k (c r)^2),
     Cov(vec V) = blockdiag(H_b^-1) + [H_b^-1 C_b] Cov(r) [H_b^-1 C_b]^T.
+
+`foresight.foresee` takes it at a scene that is yet to be filmed, the solvers at what they found.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg as sl
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 from wallmirror.derendering.likelihood import Moments, information
 from wallmirror.derendering.splines import SplineGrid
@@ -104,49 +108,70 @@ def bound_of(
     ridge = lost * float(np.trace(schur)) / max(1, schur.shape[0])
     along = float(c @ r)
 
-    def invert(ridge: float) -> Array:
-        identity = np.eye(pinned.shape[0])
-        factor = sl.cho_factor(pinned + ridge * identity, lower=True, check_finite=False)
-        covariance = sl.cho_solve(factor, identity, check_finite=False)
-        if along != 0:
-            covariance -= np.outer(r, r) / (strength * along**2)
-        return np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)
+    scale = np.zeros_like(r) if along == 0 else r / (math.sqrt(strength) * along)
+    rows = coupled.reshape(-1, r.size)
 
-    covariance = invert(ridge)
-    error = _scale_free_error(source, inverse, coupled, covariance)
+    def factor(ridge: float) -> Array:
+        raised = pinned.copy()
+        raised[np.diag_indices_from(raised)] += ridge
+        return np.asarray(sl.cholesky(raised, lower=True, overwrite_a=True, check_finite=False))
+
+    lower, sound = None, lost <= 1e-3
+    while lower is None:
+        try:
+            lower = factor(ridge)
+        except np.linalg.LinAlgError:  # rounding took more than it should: what is left is no bound
+            ridge, sound = 100 * max(ridge, 1e-290), False
+    covariance = _inverse(lower) - np.outer(scale, scale)
+    spread = (rows @ covariance).reshape(coupled.shape)
+    error = _scale_free_error(source, inverse, coupled, spread)
     # What the ridge alone holds, nothing holds: a bound on V that falls with it is none.
-    if lost > 1e-3 or _scale_free_error(source, inverse, coupled, invert(10 * ridge)) < 0.8 * error:
+    if sound:
+        solved = sl.cho_solve((factor(10 * ridge), True), rows.T, check_finite=False).T - np.outer(rows @ scale, scale)
+        sound = _scale_free_error(source, inverse, coupled, solved.reshape(coupled.shape)) >= 0.8 * error
+    if not sound:
         error = float("inf")
-    variance = np.einsum("bii->bi", inverse) + np.sum((coupled @ covariance) * coupled, axis=-1)
+    variance = np.einsum("bii->bi", inverse) + np.sum(spread * coupled, axis=-1)
     return Bound(
         coefficients=covariance,
         seen=seen,
         source_std=np.sqrt(np.maximum(variance, 0.0)).T,
-        shape_std=_shape_std(source, inverse, coupled, covariance, variance),
+        shape_std=_shape_std(source, inverse, coupled, spread, variance),
         source_error=error,
     )
 
 
-def _shape_std(source: Array, inverse: Array, coupled: Array, covariance: Array, variance: Array) -> Array:
+def _inverse(lower: Array) -> Array:
+    """The inverse of a matrix from its lower Cholesky factor, half the work of solving for the columns of 1."""
+    half, failed = lapack.dpotri(lower, lower=True)
+    if failed:
+        raise np.linalg.LinAlgError("the information is singular")
+    half = np.tril(half)
+    return np.asarray(half + np.tril(half, -1).T, dtype=np.float64)
+
+
+def _shape_std(source: Array, inverse: Array, coupled: Array, spread: Array, variance: Array) -> Array:
     """Standard deviation of V freed of its part along V: Var(dv - v (v dv) / |v|^2), shape (M, B)."""
     v = source.T
     norm = max(float(np.sum(v * v)), 1e-300)
-    pulled = np.einsum("bi,bik->k", v, coupled)
-    together = np.einsum("bij,bj->bi", inverse, v) + np.einsum("bik,k->bi", coupled, covariance @ pulled)
+    pulled = np.einsum("bi,bik->k", v, spread)
+    together = np.einsum("bij,bj->bi", inverse, v) + np.einsum("bik,k->bi", coupled, pulled)
     along = float(np.sum(v * together))
     free = variance - 2 * v * together / norm + v * v * along / norm**2
     return np.asarray(np.sqrt(np.maximum(free, 0.0)).T, dtype=np.float64)
 
 
-def _scale_free_error(source: Array, inverse: Array, coupled: Array, covariance: Array) -> float:
-    """sqrt(E |dV|^2) / |V| with dV freed of its part along V, which a global scale absorbs."""
+def _scale_free_error(source: Array, inverse: Array, coupled: Array, spread: Array) -> float:
+    """sqrt(E |dV|^2) / |V| with dV freed of its part along V, which a global scale absorbs.
+
+    `spread` is [H_b^-1 C_b] Cov(r), shape (B, M, K').
+    """
     v = source.T  # (B, M)
     norm = float(np.sum(v * v))
     if norm == 0:
         return float("inf")
-    total = float(np.einsum("bii->", inverse))
-    total += float(np.sum((coupled @ covariance) * coupled))
+    total = float(np.einsum("bii->", inverse)) + float(np.sum(spread * coupled))
     # Along V: v^T Cov v / |V|^2.
     pulled = np.einsum("bi,bik->k", v, coupled)
-    along = float(np.einsum("bi,bij,bj->", v, inverse, v)) + float(pulled @ covariance @ pulled)
+    along = float(np.einsum("bi,bij,bj->", v, inverse, v)) + float(np.einsum("bi,bik,k->", v, spread, pulled))
     return float(np.sqrt(max(total - along / norm, 0.0) / norm))

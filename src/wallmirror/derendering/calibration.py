@@ -62,6 +62,9 @@ class Calibration:
     std:
         Their standard deviations in metres: the Cramer-Rao bound with pattern and BRDF unknown too, times the noise.
         Where there is no noise, the largest shift that the remaining mismatch allows.
+    aside:
+        The card moved from there by one standard deviation along each principal axis of their joint covariance; `solve`
+        widens its error bars by what these cards make of pattern and BRDF.
     position_std:
         Standard deviations of each element's x and y in metres, shape (M, 2).
     mismatch_before, mismatch_after:
@@ -77,6 +80,7 @@ class Calibration:
     card: Card
     values: Mapping[str, float]
     std: Mapping[str, float]
+    aside: tuple[Card, ...] = field(repr=False)
     position_std: Array = field(repr=False)
     mismatch_before: float
     mismatch_after: float
@@ -159,12 +163,15 @@ def _concluded(problem: Problem, free: tuple[int, ...], result: Found) -> Calibr
     along_x = np.stack([np.full(spread.size, card.distance), np.zeros(spread.size), spread], axis=1)
     x_variance = np.einsum("mj,jk,mk->m", along_x, everything, along_x)
     y_std = found.distance * math.sqrt(max(everything[1, 1], 0.0))
+    variances, axes = np.linalg.eigh(everything)
+    shifts = [math.sqrt(v) * axis for v, axis in zip(variances, axes.T, strict=True) if v > 0]
     values = {"x": float(np.mean(found.elements_x)), "y": found.y, "width": width}
     before, after = (_mismatch(problem, at, result.step_deg) for at in (card, found))
     return Calibration(
         card=found,
         values={_NAMES[j]: values[_NAMES[j]] for j in free},
         std={_NAMES[j]: metres[_NAMES[j]] * float(s) for j, s in zip(free, std)},
+        aside=tuple(card_at(card, result.g + shift) for shift in shifts),
         position_std=np.stack([np.sqrt(np.maximum(x_variance, 0.0)), np.full(spread.size, y_std)], axis=1),
         mismatch_before=before,
         mismatch_after=after,
@@ -188,4 +195,4 @@ def _status(result: Found, before: float, after: float) -> str:
             f"{found} But the misfit is {result.excess:.2g} times the noise: the card is no scaled copy of the one given, "
             "lay further off than the search reached, or another hypothesis fails; the error bars are too small."
         )
-    return f"{found} Solve with the returned card."
+    return f"{found} Solve with the returned card, and hand this calibration on for the error bars."

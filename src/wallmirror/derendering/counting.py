@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from wallmirror.captures import CaptureSet
-from wallmirror.derendering.estimate import Estimate
-from wallmirror.derendering.noisy import NOISY_STEPS, refine, require_patterns
+from wallmirror.derendering.estimate import Estimate, doubts_of_fit
+from wallmirror.derendering.knots import NOISY_STEPS, refine
+from wallmirror.derendering.noisy import require_patterns
 from wallmirror.derendering.poisson import maximise_poisson, poisson_bound
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.subspace import SignalSpace
@@ -79,9 +80,7 @@ def solve_counts(
     transport = np.stack([t @ fit.coefficients for t in designs], axis=1)
     source = fit.source / unit
     require_patterns(problem, transport, source, sigma)
-    warnings = []
-    if not fit.converged:
-        warnings.append("the fit stopped before it converged, so the error bars may be too small")
+    warnings = doubts_of_fit(converged=fit.converged, misfit=None)
     if fit.chi_squared > 1.2:
         warnings.append(
             f"the counts scatter {fit.chi_squared:.2f} times as much as counting alone, so the model or the counts per "

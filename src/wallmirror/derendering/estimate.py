@@ -13,6 +13,9 @@ from wallmirror.derendering.subspace import ClosedForm
 
 Array = NDArray[np.float64]
 
+# A misfit beyond this many times the stated noise is no chance.
+_TOO_MUCH = 1.2
+
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
@@ -34,6 +37,8 @@ class Estimate:
         Standard deviation of rho at given angle sums.
     priors:
         What the answer rests on beside the captures, in words.
+    groups:
+        Elements that share a scale, each ascending, where there is more than the one global scale.
     """
 
     method: str
@@ -50,20 +55,40 @@ class Estimate:
     chi_squared: float
     warnings: tuple[str, ...]
     priors: tuple[str, ...] = ()
+    groups: tuple[tuple[int, ...], ...] = ()
 
 
-def scale_free_error(estimate: Array, truth: Array) -> float:
-    """Relative Frobenius error after the best global scale of the estimate.
+def doubts_of_fit(*, converged: bool, misfit: float | None) -> list[str]:
+    """What a fit's end and its misfit, in units of the stated noise variance, say against it; None where none is stated."""
+    doubts = []
+    if not converged:
+        doubts.append("the fit stopped before it converged, so the error bars may be too small")
+    if misfit is not None and misfit > _TOO_MUCH:
+        doubts.append(
+            f"the misfit is {misfit:.2f} times the stated noise, so the model (one bounce, angle-sum BRDF, geometry) or "
+            "the stated variances do not hold; the error bars were widened to match"
+        )
+    return doubts
+
+
+def scale_free_error(estimate: Array, truth: Array, groups: tuple[tuple[int, ...], ...] = ()) -> float:
+    """Relative Frobenius error after the best global scale of the estimate, or the best one of each group of its rows.
 
     Examples
     --------
     >>> scale_free_error(np.array([2.0, 4.0]), np.array([1.0, 2.0]))
+    0.0
+    >>> scale_free_error(np.array([[2.0], [9.0]]), np.array([[1.0], [3.0]]), groups=((0,), (1,)))
     0.0
     """
     # In units of the largest entry each, so that squares neither overflow nor vanish.
     found, sought = (
         np.asarray(values) / (float(np.max(np.abs(values), initial=0.0)) or 1.0) for values in (estimate, truth)
     )
+    if groups:
+        parts = [list(group) for group in groups]
+        missed = [scale_free_error(found[i], sought[i]) * float(np.linalg.norm(sought[i])) for i in parts]
+        return float(np.linalg.norm(missed) / np.linalg.norm(sought))
     power = float(np.sum(found * found))
     scale = float(np.sum(found * sought)) / power if power > 0 else 0.0
     return float(np.linalg.norm(scale * found - sought) / np.linalg.norm(sought))

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from wallmirror.derendering.components import Separated, in_words, separate
 from wallmirror.derendering.estimate import Estimate, scale_free_error
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import SplineGrid
@@ -42,10 +43,15 @@ def solve_exactly(problem: Problem, space: SignalSpace, *, step_deg: float | Non
 
     The error that is stated is the largest of three: the bound on r that mismatch and gap give, what rounding becomes
     by the condition of F, and how far the pattern moves on the next-best knots. Where no other knots have an answer
-    worth the name, the bound on r is multiplied by the condition instead.
+    worth the name, the bound on r is multiplied by the condition instead. Where several BRDFs explain the captures because
+    groups of elements share no angle, the answer is each group's up to a scale of its own (`separate`).
     """
     best, others = _search(problem, space, step_deg)
     grid, closed, designs = best.grid, best.closed, best.designs
+    if closed.near_solutions > 1:
+        separated = separate(problem.captures, problem.weighted_data, problem.weighted(designs), grid, closed)
+        if separated is not None:
+            return _in_groups(problem, best, separated)
     condition = float(np.linalg.cond(closed.transport))
     error = max(closed.error, _ROUNDING * condition)
     rivals = [other for other in others if other.error < _WORTH_A_LOOK]
@@ -79,6 +85,31 @@ def solve_exactly(problem: Problem, space: SignalSpace, *, step_deg: float | Non
         predicted_error=error,
         chi_squared=math.nan,
         warnings=warnings,
+    )
+
+
+def _in_groups(problem: Problem, best: _Try, found: Separated) -> Estimate:
+    """An answer up to one scale a group, whose error is that of the family: what lies beyond it is the gap."""
+    grid, closed, designs = best.grid, best.closed, best.designs
+    condition = float(np.linalg.cond(found.transport))
+    error = max(math.sqrt(closed.mismatch) / max(closed.beyond, 1e-300) * condition, _ROUNDING * condition)
+    transport = np.stack([t @ found.coefficients for t in designs], axis=1)
+    spread = np.full(found.source.shape, error * float(np.sqrt(np.mean(found.source**2))))
+    return Estimate(
+        method="closed_form",
+        grid=grid,
+        closed=closed,
+        coefficients=found.coefficients,
+        source=found.source,
+        transport=transport,
+        peak_at=grid.peak(found.coefficients, closed.exposure),
+        source_std=spread,
+        shape_std=spread,
+        brdf_std=lambda u: np.full(u.shape, error),
+        predicted_error=error,
+        chi_squared=math.nan,
+        warnings=(in_words(found.groups),),
+        groups=found.groups,
     )
 
 

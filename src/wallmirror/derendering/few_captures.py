@@ -105,6 +105,8 @@ class FewCaptures:
             gap=min(gap, 1.0),
             near_solutions=1,
             exposure=self.exposure,
+            family=self.coefficients[:, None],
+            beyond=min(gap, 1.0),
         )
 
 

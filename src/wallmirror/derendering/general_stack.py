@@ -12,9 +12,15 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet
-from wallmirror.derendering.problem import Problem, prepare
+from wallmirror.derendering.problem import (
+    Problem,
+    patterns_space,
+    prepare,
+    require_realisations,
+    too_few_patterns,
+)
 from wallmirror.derendering.splines import SplineGrid
-from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form, signal_space
+from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form
 from wallmirror.derendering.tables import TableGrid
 from wallmirror.transport import Kernel, build_kernel
 
@@ -47,8 +53,15 @@ class Stack:
 
     @classmethod
     def of(cls, captures: Sequence[CaptureSet], reciprocal: bool) -> Stack:
-        """Each set prepared by itself, then brought to one scale."""
-        parts = [prepare(c)[0] for c in captures]
+        """Each set prepared by itself, then brought to one scale.
+
+        Raises
+        ------
+        UndeterminedError
+            When the positions together do not show as many patterns as the card has elements; one alone need not.
+        """
+        require_realisations(captures[0].realisations, captures[0].card.elements)
+        parts = [prepare(c, few_captures=True)[0] for c in captures]
         scale = max(p.scale for p in parts)
         ratios = [p.scale / scale for p in parts]
         data = np.concatenate([p.data * ratio for p, ratio in zip(parts, ratios, strict=True)])
@@ -58,7 +71,10 @@ class Stack:
             inverse = np.concatenate([_weights(p, ratio, stated) for p, ratio in zip(parts, ratios, strict=True)])
         noisy = np.concatenate([p.noisy for p in parts])
         problem = Problem(captures[0], data, inverse, noisy, stated, scale)
-        return cls(problem, signal_space(problem.weighted_data, problem.card.elements), tuple(captures), reciprocal)
+        space, _ = patterns_space(problem)
+        if space.rank < problem.card.elements:
+            raise too_few_patterns(space.rank, problem.card.elements)
+        return cls(problem, space, tuple(captures), reciprocal)
 
     def designs(self, step_deg: float, degree: int) -> tuple[TableGrid, list[sp.csr_array]]:
         """The table of one knot spacing and T_1 .. T_M over it."""

@@ -207,7 +207,13 @@ def _schur(
     coupling = _coupling(data, state)[..., cells]
     coupled = inverse @ coupling
     schur = total if cells.size == data.size else total[np.ix_(cells, cells)]
-    schur -= coupling.reshape(-1, cells.size).T @ coupled.reshape(-1, cells.size)
+    if len(data.pairs) == 1 and np.all(free) and state.v.shape[0] > m:
+        # One H for all: sum_b C_b^T H^-1 C_b hangs on V V^T alone, so that M columns do for B.
+        few = np.linalg.qr(state.v, mode="r") @ state.pair[0].reshape(m, -1)
+        coupling = few.reshape(m, m, data.size)[..., cells]
+        schur -= coupling.reshape(-1, cells.size).T @ (inverse[0] @ coupling).reshape(-1, cells.size)
+    else:
+        schur -= coupling.reshape(-1, cells.size).T @ coupled.reshape(-1, cells.size)
     return 0.5 * (schur + schur.T), inverse, coupled
 
 

@@ -10,7 +10,7 @@ so that an iteration of a fit does not touch the pixels.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Cells whose Fisher information lies this far below the best-seen cell's are left out of the fit.
-_SEEN = 1e-10
+#: Cells whose Fisher information lies this far below the best-seen cell's are left out of the fit.
+LEAST_SEEN = 1e-10
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,19 @@ class Pairs:
         """N_ij r, shape (M, M, K)."""
         elements = math.isqrt(self.stacked.shape[0] // r.size)
         return np.asarray((self.stacked @ r).reshape(elements, elements, r.size))
+
+    def coarsened(self, prolongation: sp.csr_array) -> Pairs:
+        """R^T N_ij R: the same of coefficients that are R times coarser ones, R of shape (K, K')."""
+        size, coarse = prolongation.shape
+        elements = math.isqrt(self.stacked.shape[0] // size)
+        columns = sp.csr_array(self.stacked @ prolongation)
+        down = sp.csr_array(prolongation.T)
+        blocks = {}
+        for j in range(elements):
+            for i in range(j + 1):
+                k = (i * elements + j) * size
+                blocks[i, j] = sp.csr_array(down @ columns[k : k + size])
+        return _laid_out(blocks, elements, coarse)
 
     def mixed(self, products: Array) -> Array:
         """sum_ij products_ij N_ij for symmetric products (M, M), dense (K, K)."""
@@ -101,7 +114,7 @@ class Moments:
     @property
     def seen(self) -> NDArray[np.bool_]:
         """Which coefficients the captures see at all, shape (K,)."""
-        return np.asarray(self.exposure > _SEEN)
+        return np.asarray(self.exposure > LEAST_SEEN)
 
     def gram_of_source(self, v: Array) -> Array:
         """sum_b J_b^T W J_b, dense (K, K), for v of shape (B, M)."""
@@ -110,6 +123,12 @@ class Moments:
             rows = v[self.group == g]
             total += pairs.mixed(rows.T @ rows)
         return total
+
+    def coarsened(self, prolongation: sp.csr_array) -> Moments:
+        """The moments of coefficients r' with r = R r', for R of shape (K, K'): no pass over the data is needed."""
+        realisations, elements, size = self.cross.shape
+        cross = (self.cross.reshape(-1, size) @ prolongation).reshape(realisations, elements, -1)
+        return replace(self, pairs=[pairs.coarsened(prolongation) for pairs in self.pairs], cross=cross)
 
 
 def moments(data: Array, designs: list[sp.csr_array], inverse_variance: Array | None = None) -> Moments:
@@ -150,24 +169,31 @@ def _pairs(designs: list[sp.csr_array], weight: Array) -> Pairs:
     elements, size = len(designs), designs[0].shape[1]
     transposed = [sp.csr_array(t.T) for t in designs]
     blocks: dict[tuple[int, int], sp.csr_array] = {}
-    where, values, diagonal = [], [], np.zeros(size)
     for j, right in enumerate(designs):
         scaled = sp.csr_array(
             (right.data * np.repeat(weight, np.diff(right.indptr)), right.indices, right.indptr), right.shape
         )
         for i in range(j + 1):
-            gram = sp.csr_array(transposed[i] @ scaled)
-            blocks[i, j] = gram
+            blocks[i, j] = sp.csr_array(transposed[i] @ scaled)
+    return _laid_out(blocks, elements, size)
+
+
+def _laid_out(blocks: dict[tuple[int, int], sp.csr_array], elements: int, size: int) -> Pairs:
+    """N_ij for i <= j in the layout that their uses want."""
+    where, values, diagonal = [], [], np.zeros(size)
+    for j in range(elements):
+        for i in range(j + 1):
+            gram = blocks[i, j]
             row = np.repeat(np.arange(size, dtype=np.int64), np.diff(gram.indptr))
             where.append(row * size + gram.indices)
             if i == j:
                 diagonal += gram.diagonal()
                 values.append(0.5 * gram.data)
             else:
-                blocks[j, i] = sp.csr_array(gram.T)
                 values.append(gram.data)
+    every = [blocks[i, j] if i <= j else sp.csr_array(blocks[j, i].T) for i in range(elements) for j in range(elements)]
     return Pairs(
-        stacked=sp.csr_array(sp.vstack([blocks[i, j] for i in range(elements) for j in range(elements)], format="csr")),
+        stacked=sp.csr_array(sp.vstack(every, format="csr")),
         where=np.concatenate(where),
         values=np.concatenate(values),
         counts=np.array([v.size for v in values]),

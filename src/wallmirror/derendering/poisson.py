@@ -49,7 +49,7 @@ class PoissonFit:
     iterations:
         Scoring steps taken.
     converged:
-        Whether the last step promised less than the tolerance.
+        Whether the last step promised less than the tolerance, or a tenth of a nat where the steps had come to an end.
     """
 
     coefficients: Array
@@ -160,7 +160,7 @@ def maximise_poisson(
                 return _fit(data, r, v, mean, least_mean, total, iteration, converged=slope <= 1e3 * tolerance)
         r, v, mean = near_r, near_v, trial
         total += gained
-    return _fit(data, r, v, mean, least_mean, total, max_iterations, converged=False)
+    return _fit(data, r, v, mean, least_mean, total, max_iterations, converged=slope <= 1e3 * tolerance)
 
 
 def poisson_bound(

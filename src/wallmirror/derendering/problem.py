@@ -16,7 +16,7 @@ from wallmirror.derendering.subspace import ClosedForm, SignalSpace, noise_edge,
 from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card
 from wallmirror.memory import film_bytes, require_memory
-from wallmirror.transport import build_kernel
+from wallmirror.transport import Kernel, build_kernel
 
 Array = NDArray[np.float64]
 
@@ -85,19 +85,34 @@ class Problem:
         """T_1 .. T_M with weighted rows."""
         if self.inverse_variance is None:
             return designs
-        return [sp.csr_array(t.multiply(self.row_weights)) for t in designs]
+        weights = self.row_weights[:, 0]
+        return [
+            sp.csr_array((t.data * np.repeat(weights, np.diff(t.indptr)), t.indices, t.indptr), t.shape)
+            for t in designs
+        ]
 
-    def designs(self, step_deg: float, *, degree: int, tolerance: float) -> tuple[SplineGrid, list[sp.csr_array]]:
-        """The spline grid of one knot spacing and the transport over it, with quadrature to match."""
-        step = math.radians(step_deg)
-        kernel = build_kernel(
+    @cached_property
+    def fit_weights(self) -> Array:
+        """w of the misfit sum w (D - F V)^2: shape (P, B), or (P, 1) where all realisations share them."""
+        if self.inverse_variance is None:
+            return np.ones((self.data.shape[0], 1))
+        first = self.inverse_variance[:, :1]
+        return first if np.all(self.inverse_variance == first) else self.inverse_variance
+
+    def kernel(self, step_deg: float, tolerance: float) -> Kernel:
+        """The transport's kernel with a quadrature to match one knot spacing."""
+        return build_kernel(
             self.captures.observer,
             self.captures.card,
             weights=self.captures.transport,
-            resolution=2 * step,
+            resolution=2 * math.radians(step_deg),
             tolerance=tolerance,
         )
-        grid = grid_for(kernel, step=step, degree=degree)
+
+    def designs(self, step_deg: float, *, degree: int, tolerance: float) -> tuple[SplineGrid, list[sp.csr_array]]:
+        """The spline grid of one knot spacing and the transport over it, with quadrature to match."""
+        kernel = self.kernel(step_deg, tolerance)
+        grid = grid_for(kernel, step=math.radians(step_deg), degree=degree)
         return grid, design_matrices(kernel, grid)
 
 
@@ -131,11 +146,8 @@ def prepare(
             "two elements of the card stand at the same place, so their light cannot be told apart; give each its "
             "own position"
         )
-    if realisations < elements and not few_captures:
-        raise UndeterminedError(
-            f"{realisations} realisation(s) of the pattern cannot determine {elements} elements; capture at least "
-            f"{elements} different patterns, or use the method for few captures"
-        )
+    if not few_captures:
+        require_realisations(realisations, elements)
     if views * pixels <= elements:
         raise UndeterminedError(
             f"{views * pixels} pixel(s) cannot determine {elements} elements and a BRDF; use more pixels or views"
@@ -161,6 +173,15 @@ def prepare(
     return problem, _signal_space(problem, weak_patterns=weak_patterns)
 
 
+def require_realisations(realisations: int, elements: int) -> None:
+    """Refuse fewer patterns than elements, for a solver that stands on their space."""
+    if realisations < elements:
+        raise UndeterminedError(
+            f"{realisations} realisation(s) of the pattern cannot determine {elements} elements; capture at least "
+            f"{elements} different patterns, or use the method for few captures"
+        )
+
+
 def _inverse_variance(variance: Array, scale: float) -> tuple[Array, NDArray[np.bool_]]:
     """Weights of the pixels in units of the scale, and which of them stated their noise."""
     finite = np.isfinite(variance)
@@ -179,8 +200,8 @@ def too_few_patterns(found: int, elements: int) -> UndeterminedError:
     )
 
 
-def _signal_space(problem: Problem, *, weak_patterns: bool) -> SignalSpace:
-    """The leading M directions, with the rank counted above the noise's largest singular value."""
+def patterns_space(problem: Problem) -> tuple[SignalSpace, float]:
+    """The leading M directions, with the rank counted above the noise's largest singular value, and that value."""
     rows, realisations = problem.data.shape
     elements = problem.card.elements
     floor = noise_edge(rows, realisations) if problem.noise_is_stated else 0.0
@@ -191,6 +212,13 @@ def _signal_space(problem: Problem, *, weak_patterns: bool) -> SignalSpace:
         floor = tail / max(0.5, 1 - math.sqrt(realisations / rows)) / math.sqrt(rows) * noise_edge(rows, realisations)
         rank = int(np.count_nonzero(space.singular_values[:elements] > floor))
         space = replace(space, rank=min(rank, space.rank))
+    return space, floor
+
+
+def _signal_space(problem: Problem, *, weak_patterns: bool) -> SignalSpace:
+    """The space of the patterns, of the films projected where they do not stand out of them as they are."""
+    elements = problem.card.elements
+    space, floor = patterns_space(problem)
     if space.rank == elements:
         return space
     certain = floor < _ROUNDING * space.singular_values[0]

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from wallmirror.derendering.bounds import cramer_rao
-from wallmirror.derendering.estimate import Estimate
+from wallmirror.derendering.estimate import Estimate, doubts_of_fit
 from wallmirror.derendering.few_captures import STEPS, few_captures
 from wallmirror.derendering.likelihood import Fit, best_nonnegative, maximise, moments
 from wallmirror.derendering.problem import Problem, reduced_misfit
@@ -77,16 +77,12 @@ def solve_scarce(
     sigma = math.sqrt(max(1.0, reduced) if stated else reduced)
     peak_at = grid.peak(fit.coefficients, summed.exposure)
     bound = cramer_rao(summed, fit.coefficients, fit.source, gauge=grid.row(peak_at))
-    warnings: tuple[str, ...] = ()
-    if not fit.converged:
-        warnings = ("the fit stopped before it converged, so the error bars may be too small",)
+    warnings = doubts_of_fit(converged=fit.converged, misfit=reduced if stated else None)
     if support is not None and _reaches_beyond(problem, grid, fit):
-        warnings += (
+        warnings.append(
             f"the captures are explained far better by a BRDF that reaches beyond {math.degrees(support):g} deg, so the "
-            "support that was named does not hold; the error bars do not know that",
+            "support that was named does not hold; the error bars do not know that"
         )
-    if stated and reduced > 1.2:
-        warnings += (f"the misfit is {reduced:.2f} times the stated noise; the error bars were widened to match",)
     return Estimate(
         method="few_captures",
         grid=grid,
@@ -100,7 +96,7 @@ def solve_scarce(
         brdf_std=lambda u: sigma * bound.brdf_std(grid, u),
         predicted_error=sigma * bound.source_error,
         chi_squared=reduced if stated else math.nan,
-        warnings=warnings,
+        warnings=tuple(warnings),
         priors=tuple(priors),
     )
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wallmirror.brdf import AngleSumTable, directional_albedo
-from wallmirror.derendering.components import components
+from wallmirror.derendering.components import components, in_words, named
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.one_bounce import OneBounceCheck
 from wallmirror.derendering.problem import Problem, expected_mismatch
@@ -134,6 +134,9 @@ class Solution:
         Condition number of F.
     components:
         Number of parts with a scale of their own; 1 is the unavoidable global scale.
+    groups:
+        Elements (counted from 0) of each such part. With several, V, F and rho of each are in the scale in which its own
+        well-seen part of the BRDF peaks at 1, errors hold up to one scale each, and `scale_free_error` takes the groups.
     predicted_error:
         Expected relative error of V after the best global scale, from the Cramer-Rao bound.
     residual:
@@ -169,6 +172,7 @@ class Solution:
     gap: float
     condition: float
     components: int
+    groups: tuple[tuple[int, ...], ...]
     predicted_error: float
     residual: float
     chi_squared: float
@@ -205,6 +209,7 @@ class Solution:
             "one_bounce": None if self.one_bounce is None else asdict(self.one_bounce),
             "gauge": self.gauge,
             "priors": list(self.priors),
+            "groups": [list(group) for group in self.groups],
             "source": _finite(self.source.tolist()),
             "source_std": _finite(self.source_std.tolist()),
             "shape_std": _finite(self.shape_std.tolist()),
@@ -234,11 +239,17 @@ def conclude(
     closed, grid = estimate.closed, estimate.grid
     u = np.unique(np.append(np.linspace(grid.start, grid.stop, _CURVE_NODES), estimate.peak_at))
     curve = grid.evaluate(estimate.coefficients, u)
+    groups = estimate.groups or (tuple(range(problem.card.elements)),)
+    if len(groups) > 1 and gauge.scale != "peak":
+        raise UndeterminedError(f"one known scale does not settle {len(groups)}: {in_words(groups)}")
     # A gap of rounding's size leaves the fit nothing to choose by, and its error bars no way to know.
-    if closed.near_solutions > 1 and (estimate.method == "closed_form" or closed.gap < _NO_GAP):
-        groups = components(problem.captures, u, curve)
-        apart = "; ".join("element" + ("s " if len(g) > 1 else " ") + ", ".join(str(i + 1) for i in g) for g in groups)
-        tied = f" ({apart} share no angle of the BRDF, so each group has a scale of its own)" if len(groups) > 1 else ""
+    if len(groups) == 1 and closed.near_solutions > 1 and (estimate.method == "closed_form" or closed.gap < _NO_GAP):
+        apart = components(problem.captures, u, curve)
+        tied = (
+            f" ({named(apart)} share no angle of the BRDF, and more than a scale each is free)"
+            if len(apart) > 1
+            else ""
+        )
         raise UndeterminedError(
             f"{closed.near_solutions} different BRDFs explain the captures equally well{tied}, gap {closed.gap:.1e}; use a "
             "card or views whose reflections share more angles"
@@ -274,7 +285,7 @@ def conclude(
         verdict="doubtful" if warnings else "good",
         warnings=tuple(warnings),
         method=estimate.method,
-        gauge=gauge.words,
+        gauge=gauge.words + (" in each group" if len(groups) > 1 else ""),
         priors=estimate.priors,
         source=estimate.source * per * problem.scale,
         source_std=estimate.source_std * per * problem.scale,
@@ -288,7 +299,8 @@ def conclude(
         mismatch_expected=expected,
         gap=closed.gap,
         condition=float(np.linalg.cond(estimate.transport)),
-        components=1,  # more scales than one are refused above
+        components=len(groups),
+        groups=groups,
         predicted_error=estimate.predicted_error,
         residual=float(missed / np.linalg.norm(problem.data)),
         chi_squared=estimate.chi_squared,
@@ -305,7 +317,8 @@ def _status(problem: Problem, estimate: Estimate, warnings: list[str]) -> str:
     plural = "" if problem.data.shape[1] == 1 else "s"
     found = (
         f"Recovered {problem.card.elements} elements in {problem.data.shape[1]} pattern{plural} {how}; expect the pattern "
-        f"to be {100 * estimate.predicted_error:.2g} % off, up to one global scale."
+        f"to be {100 * estimate.predicted_error:.2g} % off, up to "
+        + (f"one scale for each of {len(estimate.groups)} groups." if len(estimate.groups) > 1 else "one global scale.")
     )
     if not warnings:
         return f"{found} No certificate objects."

@@ -10,15 +10,18 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal, TypedDict, get_args
+from typing import Literal, TypedDict, cast, get_args
 
 from threadpoolctl import threadpool_limits
 
 from wallmirror.captures import CaptureSet
+from wallmirror.derendering.calibration import Calibration
 from wallmirror.derendering.counting import solve_counts, with_counting_noise
 from wallmirror.derendering.exact import solve_exactly
-from wallmirror.derendering.noisy import NOISY_STEPS, solve_noisy
+from wallmirror.derendering.knots import NOISY_STEPS
+from wallmirror.derendering.noisy import solve_noisy
 from wallmirror.derendering.one_bounce import check_one_bounce
+from wallmirror.derendering.placed import widened
 from wallmirror.derendering.problem import Problem, expected_mismatch, prepare
 from wallmirror.derendering.scarce import solve_scarce
 from wallmirror.derendering.solution import Gauge, Scale, Solution, conclude
@@ -66,6 +69,7 @@ def solve(
     source_level: float | None = None,
     tolerance: float | None = None,
     seed: int = 0,
+    calibration: Calibration | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Solution:
     """Recover the card's pattern and the wall's BRDF together from a capture set.
@@ -97,6 +101,8 @@ def solve(
         search for finer knots. Whether the answer keeps it, `predicted_error` tells.
     seed:
         Of the random starts of the search for few captures.
+    calibration:
+        Where `calibrate` found the card: it replaces the card of the captures, and its uncertainty widens the error bars.
     progress:
         Called with a sentence at each stage.
 
@@ -125,6 +131,9 @@ def solve(
     gauge = Gauge(scale=scale, wall_albedo=wall_albedo, source_level=source_level)
     steps = (step_deg,) if step_deg else None
     history: list[str] = []
+    filmed = captures
+    if calibration is not None:
+        captures = replace(captures, card=calibration.card)
 
     def tell(stage: str) -> None:
         history.append(stage)
@@ -179,6 +188,22 @@ def solve(
                 if not quiet or exact is None:
                     raise
                 estimate = exact  # refused below, and the closed form knows the better reason
+        if calibration is not None:
+            tell(f"the same with the card one standard deviation aside, {len(calibration.aside)} times")
+            aside = [
+                solve(
+                    replace(filmed, card=card),
+                    method=cast(Method, estimate.method),
+                    nonnegative=nonnegative,
+                    support_deg=support_deg,
+                    step_deg=math.degrees(estimate.grid.step),
+                    counts_per_radiance=counts_per_radiance,
+                    background=background,
+                    seed=seed,
+                )
+                for card in calibration.aside
+            ]
+            estimate = widened(problem, estimate, aside)
         check = check_one_bounce(problem, estimate, wall_albedo=wall_albedo)
         solution = conclude(problem, space, estimate, check, gauge=gauge, seconds=lambda: time.perf_counter() - started)
         return replace(solution, history=tuple(history))

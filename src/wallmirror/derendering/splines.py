@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize_scalar
+from scipy.special import binom
 
 from wallmirror.memory import design_bytes, require_memory
 from wallmirror.transport import Kernel
@@ -78,6 +79,24 @@ class SplineGrid:
         """Coefficients that reproduce a smooth function closely (Schoenberg: its values at the supports' middles)."""
         middles = self.start + (np.arange(self.size) + 0.5 * (1 - self.degree)) * self.step
         return function(np.asarray(middles, dtype=np.float64))
+
+    def halved(self) -> SplineGrid:
+        """The grid over the same range with a knot in the middle of every interval, among whose splines are all of this."""
+        return replace(self, step=self.step / 2, intervals=2 * self.intervals)
+
+    def in_halved(self) -> sp.csr_array:
+        """R, sparse (K', K): coefficients r of this grid are R r on the `halved` one.
+
+        The two-scale relation of uniform B-splines (de Boor, A Practical Guide to Splines, 1978): each is the sum of
+        degree + 2 of half the width, with binomial coefficients over 2^degree.
+        """
+        k, j = np.arange(self.size)[:, None], np.arange(self.degree + 2)
+        finer = 2 * k - self.degree + j
+        weights = np.broadcast_to(binom(self.degree + 1, j) / 2.0**self.degree, finer.shape)
+        size = self.halved().size
+        inside = (finer >= 0) & (finer < size)  # the others vanish on the range
+        coarse = np.broadcast_to(k, finer.shape)
+        return sp.csr_array((weights[inside], (finer[inside], coarse[inside])), shape=(size, self.size))
 
     def row(self, u: float) -> Array:
         """Values of all K basis functions at one angle sum, shape (K,)."""

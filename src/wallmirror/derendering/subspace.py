@@ -18,6 +18,7 @@ import scipy.linalg as sl
 import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 Array = NDArray[np.float64]
 
@@ -70,6 +71,10 @@ class ClosedForm:
         Number of orthogonal BRDFs that explain the data as well as the best within a factor of 100, and to 1 %.
     exposure:
         How well each coefficient is seen, 1 for the best-seen, shape (K,).
+    family:
+        Those near solutions, each with |T r| = 1 and orthogonal to the others over all entries of F, shape (K, n).
+    beyond:
+        1 - lambda_(n+1): how far the best BRDF outside the family is from explaining the data.
     """
 
     coefficients: Array
@@ -79,6 +84,8 @@ class ClosedForm:
     gap: float
     near_solutions: int
     exposure: Array
+    family: Array
+    beyond: float
 
     @property
     def error(self) -> float:
@@ -133,12 +140,12 @@ def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noi
         Its standard deviation; None to estimate it from what the projection takes away.
     """
     span = sp.csc_array(sp.hstack(designs))
-    gram = (span.T @ span).toarray()
-    values, vectors = np.linalg.eigh(gram)
-    kept = values > 1e-10 * values[-1]
-    whitened = vectors[:, kept] / np.sqrt(values[kept])
-    projected = whitened.T @ (span.T @ data)  # coordinates in an orthonormal basis of the span
-    dimensions = int(np.count_nonzero(kept))
+    # Pivoted Cholesky of the Gram matrix: the columns that span, best first, and the triangle that makes them orthonormal.
+    factor, pivots, dimensions, _ = lapack.dpstrf((span.T @ span).toarray(), lower=True, tol=-1.0)
+    strength = np.diag(factor)[:dimensions]
+    dimensions = int(np.count_nonzero(strength * strength > 1e-10 * strength[0] * strength[0]))
+    span, triangle = span[:, pivots[:dimensions] - 1], factor[:dimensions, :dimensions]
+    projected = sl.solve_triangular(triangle, span.T @ data, lower=True, check_finite=False)
     left, singular, _ = np.linalg.svd(projected, full_matrices=False)
     if noise is None:
         rest = max(0.0, float(np.sum(data * data) - np.sum(projected * projected)))
@@ -147,10 +154,13 @@ def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noi
     # The span's weakest directions are known to the root of what was kept of them, no better.
     rounding = 1e-7 * singular[0]
     rank = int(np.count_nonzero(singular[:elements] > max(rounding, floor)))
-    return SignalSpace(span @ (whitened @ left[:, :elements]), singular, rank, dimensions)
+    within = sl.solve_triangular(triangle, left[:, :elements], lower=True, trans="T", check_finite=False)
+    return SignalSpace(span @ within, singular, rank, dimensions)
 
 
-def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) -> ClosedForm:
+def closed_form(
+    data: Array, designs: list[sp.csr_array], space: SignalSpace, *, band: Array | None = None
+) -> ClosedForm:
     """Recover r, F and V from data whose rank is M: minimise sum_i |(I - U U^T) T_i r|^2.
 
     Parameters
@@ -161,6 +171,8 @@ def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) ->
         T_1 .. T_M, each (P, K).
     space:
         `signal_space(data, M)` with rank M.
+    band:
+        `banded_gram(designs)` where it is known already.
 
     Notes
     -----
@@ -170,10 +182,10 @@ def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) ->
     u = space.basis
     size = designs[0].shape[1]
     stacked = np.concatenate([(t.T @ u).T for t in designs])  # H, (M^2, K); rows i*M..i*M+M-1 belong to T_i
-    band = banded_gram(designs)
+    band = banded_gram(designs) if band is None else band
     factor = _banded_cholesky(band)
-    values, leading = _leading_pairs(stacked, factor, len(designs))
-    r = sl.cho_solve_banded((factor, True), stacked.T @ leading)
+    values, vectors = _leading_pairs(stacked, factor, len(designs))
+    r = sl.cho_solve_banded((factor, True), stacked.T @ vectors[:, 0])
     projected = (stacked @ r).reshape(len(designs), -1).T  # W, (M, M): column i is U^T T_i r
     norm, missed = 0.0, 0.0
     for i, t in enumerate(designs):
@@ -189,15 +201,18 @@ def closed_form(data: Array, designs: list[sp.csr_array], space: SignalSpace) ->
         scale, source = -scale, -source
     lost = 1 - values
     # A rival explains the data nearly as well; one that misses more than a hundredth of them is none, however noisy they are.
-    near = int(np.count_nonzero(lost < min(100 * max(mismatch, 1e-15 * size), _NO_RIVAL)))
+    near = max(1, int(np.count_nonzero(lost < min(100 * max(mismatch, 1e-15 * size), _NO_RIVAL))))
+    family = sl.cho_solve_banded((factor, True), stacked.T @ vectors[:, :near]) if near > 1 else r[:, None] * scale
     return ClosedForm(
         coefficients=r * scale,
         transport=(u @ projected) * scale,
         source=source,
         mismatch=mismatch,
         gap=float(lost[1]) if lost.size > 1 else 1.0,
-        near_solutions=max(1, near),
+        near_solutions=near,
         exposure=band[0] / max(float(band[0].max()), 1e-300),
+        family=family,
+        beyond=float(lost[near]) if lost.size > near else 1.0,
     )
 
 
@@ -248,7 +263,7 @@ def _banded_cholesky(band: Array) -> Array:
 
 
 def _leading_pairs(stacked: Array, factor: Array, elements: int) -> tuple[Array, Array]:
-    """Eigenvalues of H A^-1 H^T, descending (all of them, or the first four), and the first eigenvector."""
+    """Eigenvalues of H A^-1 H^T, descending, and their eigenvectors: all of them, or the first four."""
 
     def apply(x: Any) -> Array:
         return np.asarray(stacked @ sl.cho_solve_banded((factor, True), stacked.T @ x), dtype=np.float64)
@@ -257,9 +272,9 @@ def _leading_pairs(stacked: Array, factor: Array, elements: int) -> tuple[Array,
     if elements <= _DENSE_ELEMENTS:
         matrix = apply(np.eye(n))
         values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-        return values[::-1], vectors[:, -1]
+        return values[::-1], vectors[:, ::-1]
     operator = spl.LinearOperator((n, n), matvec=apply, dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(n)
     values, vectors = spl.eigsh(operator, k=4, which="LA", v0=start, tol=1e-14)
     order = np.argsort(values)[::-1]
-    return values[order], vectors[:, order[0]]
+    return values[order], vectors[:, order]

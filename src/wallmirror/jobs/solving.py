@@ -28,14 +28,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Judgement:
-    """Errors against a known truth, after the best global scale.
+    """Errors against a known truth, after the best global scale (or the best one of each group, where there are several).
 
     Parameters
     ----------
     source_error:
         Relative error of the pattern, to compare with the solution's predicted_error.
     brdf_error:
-        Relative error of the BRDF over the angle sums known to 5 % of the peak; nan where the truth has no finite values.
+        Relative error of the BRDF over the angle sums known to 5 % of the peak; nan where the truth has no finite values,
+        or the BRDF's parts have scales of their own.
     """
 
     source_error: float
@@ -123,7 +124,7 @@ def solve_directory(
     if calibrated:
         calibration = calibrate(captures, progress=progress)
         captures = replace(captures, card=calibration.card)
-    solution = solve(captures, progress=progress, **options)
+    solution = solve(captures, calibration=calibration, progress=progress, **options)
     solved = Solved(captures, solution, truth, judge(solution, truth), calibration, options.get("tolerance"))
     write_solution(out, solved)
     return solved
@@ -135,10 +136,10 @@ def judge(solution: Solution, truth: Truth | None) -> Judgement | None:
         return None
     rho = true_brdf(solution, truth)
     brdf_error = math.nan
-    if rho is not None:
+    if rho is not None and solution.components == 1:
         seen = well_seen(solution)
         brdf_error = scale_free_error(solution.brdf[seen], rho[seen])
-    return Judgement(scale_free_error(solution.source, truth.source), brdf_error)
+    return Judgement(scale_free_error(solution.source, truth.source, solution.groups), brdf_error)
 
 
 def well_seen(solution: Solution) -> NDArray[np.bool_]:
@@ -181,7 +182,7 @@ def write_solution(out: Path, solved: Solved) -> None:
     write_together(
         out,
         {
-            "source.csv": _source_csv(solution),
+            "source.csv": source_csv(solution.source, solution.source_std),
             "brdf.csv": _brdf_csv(solution),
             "report.html": page,
             # Last, so that its presence says that the rest is complete.
@@ -223,7 +224,8 @@ def solution_sections(solved: Solved) -> list[Section]:
                 "Each dot is one element of the card in one realisation of the pattern. Only ratios can be recovered: a "
                 "brighter card before a darker wall sends back the same light.",
                 FigureBlock(
-                    recovered_source(solution, source_truth), f"The recovered pattern with error bars{beside}."
+                    recovered_source(solution.source, solution.shape_std, source_truth),
+                    f"The recovered pattern with error bars{beside}.",
                 ),
                 *(
                     ()
@@ -270,7 +272,13 @@ def certificates(solved: Solved) -> TableBlock:
     if solved.calibration is not None:
         found = solved.calibration
         for name, value in found.values.items():
-            rows.append((f"the card's {name}, found", f"{value:.6g} m", f"± {found.std[name]:.1e} m; held fixed above"))
+            rows.append(
+                (
+                    f"the card's {name}, found",
+                    f"{value:.6g} m",
+                    f"± {found.std[name]:.1e} m, which the error bars know of",
+                )
+            )
     if s.one_bounce is not None:
         check = s.one_bounce
         rows.append(
@@ -296,7 +304,8 @@ def _number(value: float) -> str:
     return "noise not stated" if math.isnan(value) else f"{value:.3f}"
 
 
-def _csv(header: list[str], rows: list[list[float]]) -> str:
+def csv_text(header: list[str], rows: list[list[float]]) -> str:
+    """A table as CSV."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
@@ -304,14 +313,13 @@ def _csv(header: list[str], rows: list[list[float]]) -> str:
     return text.getvalue()
 
 
-def _source_csv(solution: Solution) -> str:
-    elements, realisations = solution.source.shape
-    rows = [
-        [i, b, solution.source[i, b], solution.source_std[i, b]] for b in range(realisations) for i in range(elements)
-    ]
-    return _csv(["element", "realisation", "radiance", "standard_deviation"], rows)
+def source_csv(source: Array, std: Array) -> str:
+    """A pattern (M, B) with its standard deviations, a row for each entry."""
+    elements, realisations = source.shape
+    rows = [[i, b, source[i, b], std[i, b]] for b in range(realisations) for i in range(elements)]
+    return csv_text(["element", "realisation", "radiance", "standard_deviation"], rows)
 
 
 def _brdf_csv(solution: Solution) -> str:
     rows = np.stack([np.degrees(solution.angle_sum), solution.brdf, solution.brdf_std], axis=1)
-    return _csv(["angle_sum_deg", "brdf", "standard_deviation"], rows.tolist())
+    return csv_text(["angle_sum_deg", "brdf", "standard_deviation"], rows.tolist())

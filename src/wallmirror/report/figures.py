@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from wallmirror.comparison import Comparison
 from wallmirror.derendering.solution import Solution
+from wallmirror.derendering.tables import SplineTable
 from wallmirror.geometry import Card, Observer
 from wallmirror.report.style import FAINT, INK, OURS, PALE, TRUTH, WARM, clean, new_figure
 from wallmirror.scene import Room
@@ -165,9 +166,9 @@ def score_histogram(comparison: Comparison) -> Figure:
     return figure
 
 
-def recovered_source(solution: Solution, truth: Array | None = None) -> Figure:
-    """The pattern of each realisation: recovered with error bars, beside the truth where it is known."""
-    elements, realisations = solution.source.shape
+def recovered_source(source: Array, std: Array, truth: Array | None = None) -> Figure:
+    """The pattern V (M, B) of each realisation with its error bars, beside the truth where it is known."""
+    elements, realisations = source.shape
     shown = min(realisations, 8)
     columns = min(shown, 4)
     rows = math.ceil(shown / columns)
@@ -175,8 +176,8 @@ def recovered_source(solution: Solution, truth: Array | None = None) -> Figure:
     panels = np.atleast_1d(figure.subplots(rows, columns, sharey=True, sharex=True, squeeze=False)).ravel()
     scale = 1.0
     if truth is not None:
-        scale = float(np.sum(solution.source * truth) / np.sum(solution.source**2))
-    top = scale * float(np.max(solution.source)) if truth is None else float(np.max(truth))
+        scale = float(np.sum(source * truth) / np.sum(source**2))
+    top = scale * float(np.max(source)) if truth is None else float(np.max(truth))
     place = np.arange(1, elements + 1)
     for b, axes in enumerate(panels):
         if b >= shown:
@@ -185,7 +186,7 @@ def recovered_source(solution: Solution, truth: Array | None = None) -> Figure:
         if truth is not None:
             axes.bar(place, truth[:, b] / top, width=0.72, color=PALE, label="true")
         axes.errorbar(
-            place, scale * solution.source[:, b] / top, yerr=2 * scale * solution.shape_std[:, b] / top,
+            place, scale * source[:, b] / top, yerr=2 * scale * std[:, b] / top,
             fmt="o", color=OURS, markersize=5, capsize=4, label="recovered (±2 σ)",
         )  # fmt: skip
         axes.set_title(f"pattern {b + 1}", fontsize=10)
@@ -234,11 +235,37 @@ def recovered_brdf(solution: Solution, truth: Array | None = None) -> Figure:
         scale = float(np.nansum(rho * truth)) / power if power else 1.0
         axes.plot(u, scale * truth, color=TRUTH, linewidth=3.2, alpha=0.25, label="true")
     axes.plot(u, rho, color=OURS, linewidth=1.2, label="recovered")
-    axes.set_xlim(float(u[seen].min()), float(u[seen].max()))
+    shown = u[seen] if np.count_nonzero(seen) > 1 else u
+    axes.set_xlim(float(shown.min()), float(shown.max()))
     axes.set_ylim(-0.06, 1.12)
     axes.set_xlabel("angle sum θs + θo (degrees); 0 is the mirror direction")
     axes.set_ylabel("BRDF / peak")
     axes.legend(frameon=False, fontsize=9, ncols=3, loc="upper right")
+    clean(axes)
+    return figure
+
+
+def recovered_table(table: SplineTable) -> Figure:
+    """The BRDF over both angles, blank where the captures do not decide it."""
+    grid = table.grid
+    nodes = [np.linspace(g.start, g.stop, n) for g, n in zip((grid.theta_s, grid.theta_o), table.determined.shape)]
+    values = np.where(table.determined, table(nodes[0][:, None], nodes[1][None, :]), np.nan)
+    figure = new_figure(7.2, 5.2)
+    axes = figure.add_subplot()
+    (bottom, top), (left, right) = (np.degrees(axis[[0, -1]]).tolist() for axis in nodes)
+    image = axes.imshow(
+        values, origin="lower", extent=(left, right, bottom, top), cmap="viridis", vmin=0.0, vmax=1.0, aspect="auto"
+    )
+    axes.plot([left, right], [-left, -right], color=INK, linewidth=0.8, linestyle=":", label="mirror direction")
+    seen = np.argwhere(table.determined)
+    if seen.size:
+        for axis, limit in ((1, axes.set_xlim), (0, axes.set_ylim)):
+            low, high = nodes[axis][seen[:, axis].min()], nodes[axis][seen[:, axis].max()]
+            limit(float(np.degrees(low)), float(np.degrees(high)))
+    axes.set_xlabel("outgoing angle θo (degrees)")
+    axes.set_ylabel("incident angle θs (degrees)")
+    axes.legend(fontsize=9, loc="upper right", framealpha=0.9)
+    figure.colorbar(image, label="BRDF / peak")
     clean(axes)
     return figure
 

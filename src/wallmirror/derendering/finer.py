@@ -1,0 +1,167 @@
+"""What finer knots would gain, told from the fit on coarser ones: the score test, without a fit of its own.
+
+At the maximum of the likelihood on some knots the gradient g on knots twice as fine vanishes along the coarser splines.
+Were these enough, g^T S^-1 g would be noise, as large as the number of coefficients that are new (Rao, Proc. Cambridge
+Phil. Soc. 44(1), 1948); S is the information of r with V eliminated, as in `likelihood`. Conjugate gradients come near
+that number from below in a dozen products S x, each of which goes through the pixels once,
+
+    S x = sum_i T_i^T sum_b W_b (1 - F H_b^-1 F^T W_b) (sum_j V_jb T_j x) V_ib,
+
+so that neither S nor the moments of the finer knots are formed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg as sl
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from wallmirror.derendering.moments import LEAST_SEEN
+
+Array = NDArray[np.float64]
+
+_RIDGE = 1e-10
+_STEPS = 24
+# The search ends when a step adds less than this share of what was found.
+_SETTLED = 0.01
+
+
+@dataclass(frozen=True)
+class Finer:
+    """One Newton step from a fit on finer knots.
+
+    Parameters
+    ----------
+    gain:
+        g^T S^-1 g, or what of it was found when it was clear that it is enough: the fall of sum w (D - F V)^2.
+    step:
+        S^-1 g, shape (K,).
+    free:
+        How many of the K coefficients took part.
+    """
+
+    gain: float
+    step: Array
+    free: int
+
+
+@dataclass(frozen=True)
+class Films:
+    """The films with a fit to them.
+
+    Parameters
+    ----------
+    data:
+        D, shape (P, B).
+    weights:
+        w, shape (P, B) or (P, 1).
+    transport, source:
+        F (P, M) and V (M, B).
+    """
+
+    data: Array
+    weights: Array
+    transport: Array
+    source: Array
+
+    @cached_property
+    def normal(self) -> Array:
+        """H_b, shape (B, M, M), or (1, M, M) for weights of all realisations alike."""
+        rows, elements = self.transport.shape
+        squares = (self.transport[:, :, None] * self.transport[:, None, :]).reshape(rows, -1)
+        normal = (self.weights.T @ squares).reshape(-1, elements, elements)
+        normal += 1e-14 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(elements)
+        return np.asarray(normal)
+
+    def solved(self, films: Array) -> Array:
+        """H_b^-1 F^T W_b of each column, shape (M, B): the V that explains the films best."""
+        right = self.transport.T @ (self.weights * films)
+        return np.asarray(np.linalg.solve(self.normal, right.T[..., None])[..., 0].T)
+
+    def unexplained(self, films: Array) -> Array:
+        """W_b (1 - F H_b^-1 F^T W_b) of each column, shape (P, B)."""
+        return np.asarray(self.weights * (films - self.transport @ self.solved(films)))
+
+    def condensed(self) -> Films:
+        """Films of M columns with the same g and S, where all realisations share their weights: D Q and R^T for V^T = Q R."""
+        if self.weights.shape[1] > 1 or self.source.shape[1] <= self.source.shape[0]:
+            return self
+        q, triangle = np.linalg.qr(self.source.T)
+        return replace(self, data=self.data @ q, source=triangle.T)
+
+    def objective(self) -> float:
+        """sum w (D - F V)^2."""
+        return float(np.sum(self.weights * (self.data - self.transport @ self.source) ** 2))
+
+
+def score(films: Films, designs: list[sp.csr_array], band: Array, free: NDArray[np.bool_], *, enough: float) -> Finer:
+    """The Newton step from a fit whose V is the best for its F, on the splines of other designs.
+
+    Parameters
+    ----------
+    designs:
+        T_1 .. T_M on the finer knots, (P, K).
+    band:
+        Lower band of sum_i T_i^T W T_i, as `banded_gram` makes it: with the pattern's mean power it stands for S.
+    free:
+        Coefficients that may move, shape (K,); those among them that the captures do not see are left alone.
+    enough:
+        Gain at which the search may end.
+    """
+    films = films.condensed()
+    v = films.source
+    moving = free & (band[0] > LEAST_SEEN * max(float(band[0].max()), 1e-300))
+    band = band * float(np.mean(np.sum(v * v, axis=1)))
+    band[0] += _RIDGE * float(band[0].max())
+    factor = sl.cholesky_banded(band, lower=True, check_finite=False)
+
+    tall = sp.csr_array(sp.vstack(designs, format="csr"))
+    wide = tall.T
+    elements = len(designs)
+
+    def back(weighted: Array) -> Array:
+        return np.where(moving, wide @ (weighted @ v.T).T.ravel(), 0.0)
+
+    def apply(x: Array) -> Array:
+        return back(films.unexplained((tall @ x).reshape(elements, -1).T @ v))
+
+    x = np.zeros(designs[0].shape[1])
+    residual = back(films.unexplained(films.data))
+    along, before, gain = np.zeros_like(x), 1.0, 0.0
+    for _ in range(_STEPS):
+        preconditioned = np.where(moving, sl.cho_solve_banded((factor, True), residual, check_finite=False), 0.0)
+        now = float(residual @ preconditioned)
+        if not now > 0:
+            break
+        along = preconditioned + (now / before) * along
+        image = apply(along)
+        curvature = float(along @ image)
+        if not curvature > 0:
+            break
+        length = now / curvature
+        x += length * along
+        residual -= length * image
+        gain += length * now
+        before = now
+        if gain >= enough or length * now < _SETTLED * gain:
+            break
+    return Finer(gain, x, int(np.count_nonzero(moving)))
+
+
+def worth(added: int, freedom: int) -> float:
+    """The fall of the misfit, in units of the noise, that noise alone lets so many more coefficients make in 1 % of cases.
+
+    Akaike's 2 a coefficient would weigh the error that coarse splines make against the noise of finer ones. Error bars
+    know of the noise alone, so that coarse knots are kept only while their own error does not show.
+
+    Parameters
+    ----------
+    freedom:
+        Data that are left over to tell the noise by, where it is not stated.
+    """
+    return added + 2.33 * math.sqrt(2 * added * (1 + added / max(1, freedom)))

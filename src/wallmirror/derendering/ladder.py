@@ -1,0 +1,196 @@
+"""Nested spline grids for the BRDF of one problem, with what a fit needs of the data on each, made when first asked for.
+
+Every grid halves the knot spacing of the one before, so that the splines of each lie among those of the next, and what a
+fit needs of the data on coarse knots follows from what it needs on finer ones without another pass over the pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spl
+from numpy.typing import NDArray
+
+from wallmirror.derendering.finer import worth
+from wallmirror.derendering.likelihood import Fit, best_nonnegative, maximise
+from wallmirror.derendering.moments import Moments, moments
+from wallmirror.derendering.problem import Problem
+from wallmirror.derendering.splines import SplineGrid, design_matrices
+from wallmirror.derendering.subspace import ClosedForm, SignalSpace, banded_gram, closed_form
+
+Array = NDArray[np.float64]
+
+#: Between knots the fits need not be finer than this share of the misfit.
+ROUGH = 1e-6
+# That of the closed form: splines of degree 3 need knots half as far apart for lobes of the same width.
+_DEGREE = 7
+# Quadrature of the fit, of a lobe's peak.
+_FINEST_QUADRATURE = 1e-5
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """The grids, coarsest first, and what belongs to each by its index.
+
+    Parameters
+    ----------
+    quadrature:
+        Error of the quadrature, of a lobe's peak.
+    """
+
+    problem: Problem
+    space: SignalSpace
+    grids: tuple[SplineGrid, ...]
+    quadrature: float
+    _designs: dict[int, list[sp.csr_array]] = field(default_factory=dict)
+    _summed: dict[int, Moments] = field(default_factory=dict)
+    _bands: dict[int, Array] = field(default_factory=dict)
+    _closed: dict[int, ClosedForm] = field(default_factory=dict)
+    _free: dict[int, Fit] = field(default_factory=dict)
+    _bounded: dict[int, Fit] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, problem: Problem, space: SignalSpace, steps: tuple[float, ...], tolerance: float | None) -> Ladder:
+        """Over the angle sums of a problem; one spacing in degrees, or several, each half of the one before."""
+        quadrature = _quadrature(problem, tolerance)
+        u = problem.kernel(steps[-1], quadrature).angle_sum
+        room = math.radians(steps[-1]) if len(steps) > 1 else 0.0  # other quadratures reach a little further
+        grids = [
+            SplineGrid.covering(
+                float(u.min()) - room, float(u.max()) + room, step=math.radians(steps[0]), degree=_DEGREE
+            )
+        ]
+        for _ in steps[1:]:
+            grids.append(grids[-1].halved())
+        return cls(problem, space, tuple(grids), quadrature)
+
+    @property
+    def last(self) -> int:
+        """Index of the finest grid."""
+        return len(self.grids) - 1
+
+    def designs(self, index: int) -> list[sp.csr_array]:
+        """T_1 .. T_M, each sparse (P, K)."""
+        if index not in self._designs:
+            grid = self.grids[index]
+            kernel = self.problem.kernel(math.degrees(grid.step), self.quadrature)
+            self._designs[index] = design_matrices(kernel, grid)
+        return self._designs[index]
+
+    def summed(self, index: int) -> Moments:
+        """Of the two finest from the pixels, of the others from the next finer one."""
+        if index not in self._summed:
+            if index < self.last - 1:
+                made = self.summed(index + 1).coarsened(self.grids[index].in_halved())
+            else:
+                made = moments(self.problem.data, self.designs(index), self.problem.inverse_variance)
+            self._summed[index] = made
+        return self._summed[index]
+
+    def closed(self, index: int) -> ClosedForm:
+        """The closed form."""
+        if index not in self._closed:
+            weighted = self.problem.weighted(self.designs(index))
+            band = self.band(index)
+            self._closed[index] = closed_form(self.problem.weighted_data, weighted, self.space, band=band)
+        return self._closed[index]
+
+    def band(self, index: int) -> Array:
+        """Lower band of sum_i T_i^T W T_i."""
+        if index not in self._bands:
+            self._bands[index] = banded_gram(self.problem.weighted(self.designs(index)))
+        return self._bands[index]
+
+    def bounded(self, index: int, free: Fit) -> Fit:
+        """The maximum within the bounds, from the free one, or from coarser knots where that leads nowhere near it."""
+        if index not in self._bounded:
+            summed = self.summed(index)
+            # Clipping a start can throw it into the valley of another maximum, so the first start is the best rho >= 0 for
+            # the free maximum's pattern.
+            best = maximise(summed, best_nonnegative(summed, free.source))
+            for start in ("free", "coarser"):
+                if self.agrees(index, free, best):
+                    break
+                r = free.coefficients if start == "free" else self._from_coarser(index)
+                best = min(best, maximise(summed, r), key=lambda fit: fit.objective)
+            self._bounded[index] = best
+        return self._bounded[index]
+
+    def agrees(self, index: int, free: Fit, bounded: Fit) -> bool:
+        """Whether the bounds cost what they do where the truth keeps them: about one unit of noise a coefficient, not more."""
+        summed = self.summed(index)
+        noise = free.objective / max(1, summed.observations - summed.size)
+        return bounded.objective <= free.objective + 3 * summed.size * noise
+
+    def _from_coarser(self, index: int) -> Array:
+        """The closed form's r on the coarsest knots, and on finer ones the maximum within the bounds of the coarser."""
+        if index == 0:
+            return self.closed(0).coefficients
+        if index - 1 not in self._free:
+            start = self.closed(index - 1).coefficients
+            self._free[index - 1] = maximise(self.summed(index - 1), start, nonnegative=False, tolerance=ROUGH)
+        return self.refined(index - 1, self.bounded(index - 1, self._free[index - 1]).coefficients, index)
+
+    def as_fine_as_the_bounds_want(self, index: int, free: Fit) -> tuple[int, Fit]:
+        """These knots, or coarser ones with which the bounded fit is as good.
+
+        Light that the model does not know is followed by free fits on fine knots, with a rho below zero. Bounds do not
+        follow it, and then finer knots have nothing to say for themselves.
+        """
+        while index > 0:
+            fit = self.bounded(index, free)
+            if self.agrees(index, free, fit):
+                break
+            self._from_coarser(index)
+            coarser = self.bounded(index - 1, self._free[index - 1])
+            freedom = self.freedom(index)
+            price = worth(self.seen(index) - self.seen(index - 1), freedom) * self.variance(fit.objective, freedom)
+            if coarser.objective - fit.objective >= price:
+                break
+            index, free = index - 1, self._free[index - 1]
+        return index, free
+
+    def seen(self, index: int) -> int:
+        """How many coefficients the captures see."""
+        return int(np.count_nonzero(self.summed(index).seen))
+
+    def freedom(self, index: int) -> int:
+        """Data that are left over to tell the noise by."""
+        summed = self.summed(index)
+        return int(summed.observations - np.count_nonzero(summed.seen) - summed.cross.shape[0] * summed.elements)
+
+    def spare(self, index: int) -> float:
+        """Share of the data that as many coefficients as the grid has leave over; told before the grid's moments are made."""
+        known = next(iter(self._summed.values()))
+        unknown = self.grids[index].size + known.cross.shape[0] * known.elements
+        return float(1 - unknown / max(1, known.observations))
+
+    def variance(self, objective: float, freedom: int) -> float:
+        """Of the noise in units of the weights: 1 where it is stated, else what a misfit says."""
+        return 1.0 if self.problem.noise_is_stated else objective / max(1, freedom)
+
+    def refined(self, index: int, r: Array, to: int) -> Array:
+        """Coefficients of one grid on a finer one."""
+        for grid in self.grids[index:to]:
+            r = grid.in_halved() @ r
+        return r
+
+    def coarsened(self, index: int, r: Array) -> Array:
+        """Coefficients on the next coarser grid that come nearest where the captures look."""
+        halved = self.grids[index - 1].in_halved()
+        weighted = sp.csr_array(halved.multiply(self.summed(index).exposure[:, None]))
+        gram = sp.csc_array(weighted.T @ halved)
+        gram += 1e-9 * float(gram.diagonal().max()) * sp.eye_array(gram.shape[0])
+        return np.asarray(spl.spsolve(gram, weighted.T @ r), dtype=np.float64)
+
+
+def _quadrature(problem: Problem, tolerance: float | None) -> float:
+    """Quadrature error, of a lobe's peak, that a tolerance of the pattern allows and the noise hides."""
+    if tolerance is None or problem.inverse_variance is None or not problem.noise_is_stated:
+        return _FINEST_QUADRATURE
+    weights = problem.inverse_variance[problem.inverse_variance > 0]
+    hidden = 0.1 / math.sqrt(float(np.median(weights)))
+    return min(1e-3, max(_FINEST_QUADRATURE, min(1e-2 * tolerance, hidden)))

@@ -1,0 +1,179 @@
+"""The choice of knots: nested splines, moments without another pass, and the score test that tells what finer knots gain.
+
+Each is held against the long way round: dense products, or the fit itself.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+from wallmirror.captures import CaptureSet
+from wallmirror.derendering.finer import Films, Finer, score, worth
+from wallmirror.derendering.likelihood import Fit, maximise, moments
+from wallmirror.derendering.solve import solve
+from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
+from wallmirror.derendering.subspace import banded_gram
+from wallmirror.geometry import Card, Observer
+from wallmirror.transport import build_kernel, radiance, transport_matrix
+
+from .helpers import EPS, lobes, thesis_card, thesis_observer
+
+Array = NDArray[np.float64]
+
+
+@pytest.mark.parametrize("degree", [1, 3, 7])
+def test_splines_of_a_grid_lie_among_those_of_the_halved_one(degree: int) -> None:
+    grid = SplineGrid(start=-0.3, step=0.1, intervals=7, degree=degree)
+    r = np.random.default_rng(0).standard_normal(grid.size)
+    finer = grid.halved()
+    u = np.linspace(finer.start, finer.stop, 301)
+    # Against SciPy's splines of the coarse knots: a sum of degree + 2 products of order one.
+    knots = grid.start + grid.step * np.arange(-degree, grid.intervals + degree + 1)
+    np.testing.assert_allclose(
+        finer.evaluate(grid.in_halved() @ r, u), BSpline(knots, r, degree)(u), atol=100 * EPS, rtol=0
+    )
+
+
+def scene() -> tuple[Observer, Card]:
+    return thesis_observer(60, 6), thesis_card(3)
+
+
+@functools.cache
+def nested(step_deg: float) -> tuple[SplineGrid, list[object], list[object]]:
+    """A grid with its designs and those of the halved one."""
+    kernel = build_kernel(*scene(), weights="cosine")
+    grid = grid_for(kernel, step=math.radians(step_deg), degree=5)
+    return grid, list(design_matrices(kernel, grid)), list(design_matrices(kernel, grid.halved()))
+
+
+def noisy(*, sigma_deg: float, noise: float, seed: int) -> Array:
+    source = 0.2 + np.random.default_rng(3).random((3, 7))
+    films = radiance(transport_matrix(*scene(), lobes(sigma_deg=sigma_deg), weights="cosine"), source)
+    films = films.reshape(-1, source.shape[1])
+    return np.asarray(films + noise * np.random.default_rng((9, seed)).standard_normal(films.shape))
+
+
+@pytest.mark.parametrize("columns", [1, 7], ids=["weights alike", "weights of each realisation"])
+def test_moments_of_coarse_knots_follow_from_those_of_finer_ones(columns: int) -> None:
+    grid, coarse, fine = nested(8.0)
+    data = noisy(sigma_deg=6, noise=0.01, seed=0)
+    weights = np.broadcast_to(10.0 ** np.random.default_rng(1).uniform(-1, 1, (data.shape[0], columns)), data.shape)
+    there = moments(data, coarse, weights)  # type: ignore[arg-type]
+    back = moments(data, fine, weights).coarsened(grid.in_halved())  # type: ignore[arg-type]
+    r, v = np.random.default_rng(2).random(grid.size), np.random.default_rng(4).random((7, 3))
+    for a, b in [
+        (back.cross, there.cross),
+        (back.exposure, there.exposure),
+        (back.gram_of_source(v), there.gram_of_source(v)),
+        (back.pairs[0].times(r), there.pairs[0].times(r)),
+    ]:
+        np.testing.assert_allclose(a, b, atol=1e-13 * np.max(np.abs(b)), rtol=0)  # sums of some 400 rows
+    assert len(back.pairs) == columns
+
+
+# -- the score test -------------------------------------------------------------------------------------------------
+
+
+def by_score(data: Array, weights: Array, step_deg: float = 8.0) -> tuple[Finer, Fit, Fit]:
+    """The score test, the fit that it starts from, and the fit that it stands for."""
+    grid, coarse, fine = nested(step_deg)
+    everywhere = np.broadcast_to(weights, data.shape)
+    best = maximise(
+        moments(data, coarse, everywhere),  # type: ignore[arg-type]
+        grid.interpolate(lobes(sigma_deg=6).of_sum),
+        nonnegative=False,
+        tolerance=1e-12,
+    )
+    halved = grid.in_halved()
+    finer = maximise(
+        moments(data, fine, everywhere),  # type: ignore[arg-type]
+        halved @ best.coefficients,
+        nonnegative=False,
+        tolerance=1e-12,
+    )
+    transport = np.stack([t @ best.coefficients for t in coarse], axis=1)  # type: ignore[operator]
+    films = Films(data, weights, transport, best.source)
+    rows = np.sqrt(np.mean(weights, axis=1))
+    band = banded_gram([t * 1.0 for t in fine]) if np.ptp(rows) == 0 else banded_gram(fine)  # type: ignore
+    found = score(films, fine, band, np.ones(halved.shape[0], dtype=bool), enough=math.inf)  # type: ignore[arg-type]
+    return found, best, finer
+
+
+@pytest.mark.parametrize("columns", [1, 7], ids=["weights alike", "weights of each realisation"])
+def test_the_score_foretells_what_the_fit_on_finer_knots_gains(columns: int) -> None:
+    data = noisy(sigma_deg=6, noise=0.02, seed=1)
+    weights = 10.0 ** np.random.default_rng(1).uniform(-0.5, 0.5, (data.shape[0], columns))
+    found, best, finer = by_score(data, weights)
+    # One step from a maximum whose surroundings are nearly quadratic, and a search that ends at a part in a hundred.
+    assert found.gain == pytest.approx(best.objective - finer.objective, rel=0.05)
+    # The twin: the step's promise is not the misfit itself, nor nothing.
+    assert 0.01 < found.gain / best.objective < 0.9
+
+
+def test_films_of_many_realisations_condense_to_as_many_as_there_are_elements() -> None:
+    data = noisy(sigma_deg=6, noise=0.02, seed=1)
+    weights = np.ones((data.shape[0], 1))
+    many, _, _ = by_score(data, np.ones(data.shape))
+    few, _, _ = by_score(data, weights)
+    assert few.gain == pytest.approx(many.gain, rel=1e-9)
+    films = Films(data, weights, np.ones((data.shape[0], 3)), np.ones((3, 7)))
+    assert films.condensed().data.shape == (data.shape[0], 3)
+    assert replace(films, weights=np.ones(data.shape)).condensed().data.shape == data.shape
+
+
+def test_knots_that_are_fine_enough_pass_at_the_rate_of_the_test() -> None:
+    """Finer knots than the truth's gain what noise lets them: the price is exceeded in about 1 % of cases."""
+    grid, coarse, fine = nested(16.0)
+    r = grid.interpolate(lobes(sigma_deg=20).of_sum)
+    source = 0.2 + np.random.default_rng(3).random((3, 7))
+    clean = np.stack([t @ r for t in coarse], axis=1) @ source  # type: ignore[operator]
+    noise = 0.01
+    gains, prices = [], []
+    for seed in range(120):
+        data = clean + noise * np.random.default_rng((5, seed)).standard_normal(clean.shape)
+        summed = moments(data, coarse, np.full(data.shape, noise**-2))  # type: ignore[arg-type]
+        best = maximise(summed, r, nonnegative=False, tolerance=1e-10)
+        transport = np.stack([t @ best.coefficients for t in coarse], axis=1)  # type: ignore[operator]
+        films = Films(data, np.full((data.shape[0], 1), noise**-2), transport, best.source)
+        every = np.ones(grid.halved().size, dtype=bool)
+        found = score(films, fine, banded_gram(fine), every, enough=math.inf)  # type: ignore[arg-type]
+        gains.append(found.gain)
+        prices.append(worth(found.free - int(np.count_nonzero(summed.seen)), 10**9))
+    added = found.free - int(np.count_nonzero(summed.seen))
+    # chi-square of `added` degrees: mean within 3.5 of its standard errors, less the hundredth that the search leaves.
+    assert np.mean(gains) == pytest.approx(added, abs=3.5 * math.sqrt(2 * added / 120) + 0.02 * added)
+    passed = np.mean(np.array(gains) > prices)
+    assert passed <= 0.01 + 3.5 * math.sqrt(0.01 * 0.99 / 120)
+    # The twin: a lobe that these knots cannot follow passes every time.
+    rough, _, _ = by_score(noisy(sigma_deg=4, noise=0.01, seed=0), np.full((clean.shape[0], 1), noise**-2), 16.0)
+    assert rough.gain > 2 * prices[-1]
+
+
+def test_the_price_allows_for_noise_that_few_data_tell() -> None:
+    assert worth(100, 10**9) == pytest.approx(100 + 2.33 * math.sqrt(200))
+    assert worth(100, 100) == pytest.approx(100 + 2.33 * math.sqrt(400))
+
+
+def test_knots_follow_the_noise_and_the_lobes() -> None:
+    """The same wall in less noise calls for finer knots, and broader lobes for coarser ones."""
+
+    def step(sigma_deg: float, decibels: float) -> float:
+        source = np.random.default_rng(5).random((3, 9))
+        films = radiance(transport_matrix(*scene(), lobes(sigma_deg=sigma_deg), weights="cosine"), source)
+        noise = float(np.sqrt(np.mean(films**2))) * 10 ** (-decibels / 20)
+        films = films + noise * np.random.default_rng(1).standard_normal(films.shape)
+        variance = np.full(films.shape, noise**2)
+        observer, card = scene()
+        captures = CaptureSet(observer=observer, card=card, transport="cosine", radiance=films, variance=variance)
+        return solve(captures).step_deg
+
+    steps = step(5, 0), step(5, 60), step(2, 0)
+    assert steps[1] < steps[0]
+    assert steps[2] < steps[0]
