@@ -130,7 +130,7 @@ def front_loading(seed: int) -> ThesisFigure:
         for bar in bars.bar(place + aside, [case[name] for case in cases.values()], 0.36, color=colour, label=name):
             top = (bar.get_x() + 0.18, bar.get_height())
             bars.annotate(f"{bar.get_height():.0%}", top, ha="center", va="bottom", fontsize=8)
-    bars.set_xticks(place, [name.replace(", ", ",\n") for name in cases], fontsize=8)
+    bars.set_xticks(place, [_stacked(name) for name in cases], fontsize=8)
     bars.set_title("the wall's channels, convolved exactly", fontsize=10, loc="left")
     bars.set_ylabel("share of runs found")
     for axes in (front, white, bars):
@@ -196,6 +196,11 @@ def front_loading(seed: int) -> ThesisFigure:
             ),
         ),
     )
+
+
+def _stacked(name: str) -> str:
+    """A case's name over several lines, narrow enough to stand under its bars."""
+    return name.replace(", ", ",\n").replace(" patterns", "\npatterns").replace("patterns less", "patterns\nless")
 
 
 def _why(positive: float, equally_loaded: float, signed: float) -> Outcome:
