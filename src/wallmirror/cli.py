@@ -245,6 +245,12 @@ def solve(
     reciprocal: Annotated[
         bool, typer.Option("--reciprocal", help="General: the BRDF is the same with its angles exchanged.")
     ] = False,
+    wall: Annotated[
+        str,
+        typer.Option(
+            help="angle_sum, microfacet (two exponents more, for walls of rough facets), or auto: what the films require."
+        ),
+    ] = "angle_sum",
     nonnegative: Annotated[bool, typer.Option(help="Keep BRDF and pattern >= 0.")] = True,
     support_deg: Annotated[
         float | None, typer.Option(help="Few captures: the BRDF is 0 beyond this angle sum (degrees).")
@@ -291,6 +297,7 @@ def solve(
         calibrated=calibrate,
         progress=terminal.note,
         method=method,  # type: ignore[arg-type]  # `solve` checks it and names the choices
+        wall=wall,  # type: ignore[arg-type]
         nonnegative=nonnegative,
         support_deg=support_deg,
         step_deg=step_deg,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +11,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet
+from wallmirror.derendering.facets import Factor, weighted
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, noise_edge, signal_space, space_within
 from wallmirror.errors import UndeterminedError
@@ -45,6 +46,8 @@ class Problem:
         Pixels whose stated variance is their noise, (P, B): neither saturated nor raised to the floor.
     noise_is_stated:
         Whether the weights are inverse variances of all noise, and not only tell which pixels count.
+    exponents:
+        Of the factors that the wall has beside a function of the angle sum (`facets`).
     """
 
     captures: CaptureSet
@@ -53,6 +56,7 @@ class Problem:
     noisy: NDArray[np.bool_]
     noise_is_stated: bool
     scale: float
+    exponents: dict[Factor, float] = field(default_factory=dict)
 
     @property
     def card(self) -> Card:
@@ -101,13 +105,14 @@ class Problem:
 
     def kernel(self, step_deg: float, tolerance: float) -> Kernel:
         """The transport's kernel with a quadrature to match one knot spacing."""
-        return build_kernel(
+        kernel = build_kernel(
             self.captures.observer,
             self.captures.card,
             weights=self.captures.transport,
             resolution=2 * math.radians(step_deg),
             tolerance=tolerance,
         )
+        return weighted(kernel, self.exponents)
 
     def designs(self, step_deg: float, *, degree: int, tolerance: float) -> tuple[SplineGrid, list[sp.csr_array]]:
         """The spline grid of one knot spacing and the transport over it, with quadrature to match."""

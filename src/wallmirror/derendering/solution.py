@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wallmirror.brdf import AngleSumTable, directional_albedo
+from wallmirror.derendering.angle_sum_check import AngleSumCheck
 from wallmirror.derendering.components import components, in_words, named
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.one_bounce import OneBounceCheck
@@ -32,9 +33,10 @@ _HOW = {
     "few_captures": "from few captures",
     "poisson": "by the likelihood of counts",
 }
-_FITS = ("maximum_likelihood", "poisson")
-# Error bars beyond this share of the pattern mean that the data do not determine it.
-_UNDETERMINED = 0.5
+#: Methods that fit a likelihood.
+FITS = ("maximum_likelihood", "poisson")
+#: Error bars beyond this share of the pattern mean that the data do not determine it.
+UNDETERMINED = 0.5
 _CURVE_NODES = 2401
 # A bias beyond this share of the error bars is told.
 _BIAS_TOLD = 0.5
@@ -147,6 +149,9 @@ class Solution:
         Knot spacing of the BRDF's spline in degrees.
     one_bounce:
         What light beyond one bounce would do to this solution; None where nothing but the wall reflects.
+    angle_sum_check:
+        What a wall that is no function of the angle sum would do to this solution, and the factors that `brdf` is to be
+        multiplied with where a wall of facets was fitted; None where the method has no such check.
     seconds:
         Time the solver took.
     history:
@@ -178,6 +183,7 @@ class Solution:
     chi_squared: float
     step_deg: float
     one_bounce: OneBounceCheck | None
+    angle_sum_check: AngleSumCheck | None
     seconds: float
     history: tuple[str, ...] = ()
 
@@ -207,6 +213,7 @@ class Solution:
             "warnings": list(self.warnings),
             "history": list(self.history),
             "one_bounce": None if self.one_bounce is None else asdict(self.one_bounce),
+            "angle_sum_check": None if self.angle_sum_check is None else asdict(self.angle_sum_check),
             "gauge": self.gauge,
             "priors": list(self.priors),
             "groups": [list(group) for group in self.groups],
@@ -225,6 +232,7 @@ def conclude(
     space: SignalSpace,
     estimate: Estimate,
     one_bounce: OneBounceCheck | None,
+    angle_sum: AngleSumCheck | None,
     *,
     gauge: Gauge,
     seconds: Callable[[], float],
@@ -254,7 +262,7 @@ def conclude(
             f"{closed.near_solutions} different BRDFs explain the captures equally well{tied}, gap {closed.gap:.1e}; use a "
             "card or views whose reflections share more angles"
         )
-    if not estimate.predicted_error <= _UNDETERMINED:
+    if not estimate.predicted_error <= UNDETERMINED:
         raise UndeterminedError(
             f"the captures leave the pattern undetermined (its error bars come to {100 * estimate.predicted_error:.0f} "
             "% of it); capture more light, more views or more patterns"
@@ -264,7 +272,7 @@ def conclude(
     missed = np.linalg.norm(problem.data - estimate.transport @ estimate.source)
     warnings = list(estimate.warnings)
     expected = expected_mismatch(problem, space, closed)
-    if estimate.method in _FITS and closed.mismatch > 10 * expected and closed.mismatch > 1e-6:
+    if estimate.method in FITS and closed.mismatch > 10 * expected and closed.mismatch > 1e-6:
         warnings.append(
             f"the closed form misses the data's space by {closed.mismatch:.1e} where noise explains {expected:.1e}, so "
             "the geometry, Hypothesis 2 (one bounce) or Hypothesis 8 (angle sum) does not hold"
@@ -306,6 +314,7 @@ def conclude(
         chi_squared=estimate.chi_squared,
         step_deg=math.degrees(grid.step),
         one_bounce=one_bounce,
+        angle_sum_check=angle_sum,
         seconds=seconds(),
     )
 

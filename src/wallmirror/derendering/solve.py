@@ -15,8 +15,10 @@ from typing import Literal, TypedDict, cast, get_args
 from threadpoolctl import threadpool_limits
 
 from wallmirror.captures import CaptureSet
+from wallmirror.derendering.angle_sum_check import check_angle_sum, fit_facets, with_doubt
 from wallmirror.derendering.calibration import Calibration
 from wallmirror.derendering.counting import solve_counts, with_counting_noise
+from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.exact import solve_exactly
 from wallmirror.derendering.knots import NOISY_STEPS
 from wallmirror.derendering.noisy import solve_noisy
@@ -24,17 +26,19 @@ from wallmirror.derendering.one_bounce import check_one_bounce
 from wallmirror.derendering.placed import widened
 from wallmirror.derendering.problem import Problem, expected_mismatch, prepare
 from wallmirror.derendering.scarce import solve_scarce
-from wallmirror.derendering.solution import Gauge, Scale, Solution, conclude
+from wallmirror.derendering.solution import FITS, UNDETERMINED, Gauge, Scale, Solution, conclude
 from wallmirror.derendering.subspace import SignalSpace
 from wallmirror.errors import InputError, UndeterminedError
 
 Method = Literal["auto", "closed_form", "maximum_likelihood", "few_captures", "poisson"]
+Wall = Literal["angle_sum", "microfacet", "auto"]
 
 
 class SolveOptions(TypedDict, total=False):
     """The options of `solve`, for functions that hand them on."""
 
     method: Method
+    wall: Wall
     nonnegative: bool
     support_deg: float | None
     step_deg: float | None
@@ -59,6 +63,7 @@ def solve(
     captures: CaptureSet,
     *,
     method: Method = "auto",
+    wall: Wall = "angle_sum",
     nonnegative: bool = True,
     support_deg: float | None = None,
     step_deg: float | None = None,
@@ -82,6 +87,10 @@ def solve(
         "closed_form" (exact without noise), "maximum_likelihood" (normal noise), "few_captures" (fewer captures than
         elements, by a search that rests on the priors named), "poisson" (photon counts); or "auto": few captures where
         B < M, else the closed form when its own certificate finds no noise, else maximum likelihood.
+    wall:
+        "angle_sum" (Hypothesis 8: rho depends on the angle sum), "microfacet" (such a function times two factors of both
+        angles whose exponents are fitted, see `facets`; with maximum likelihood and for counts), or "auto": facets where the
+        films reject the angle sum.
     nonnegative:
         Keep rho >= 0 and V >= 0, except in the closed form.
     support_deg:
@@ -127,6 +136,7 @@ def solve(
     few = method == "few_captures" or (method == "auto" and captures.realisations < captures.card.elements)
     if tolerance is not None and not 0 < tolerance < 1:
         raise InputError(f"is {tolerance:g}; give a relative error between 0 and 1", field="tolerance")
+    _check_wall(wall, method, few, scale)
     _check_options(method, few, support_deg, step_deg, counts_per_radiance, background, seed)
     gauge = Gauge(scale=scale, wall_albedo=wall_albedo, source_level=source_level)
     steps = (step_deg,) if step_deg else None
@@ -146,18 +156,14 @@ def solve(
     # The matrices are small: two BLAS threads that wait for each other are up to a hundred times slower than one.
     with threadpool_limits(limits=1, user_api="blas"):
         problem, space = prepare(captures, few_captures=few, weak_patterns=method != "closed_form")
-        estimate = exact = None
-        quiet = False
-        if few:
-            tell(f"{captures.realisations} captures for {captures.card.elements} elements: search for few captures")
-            support = None if support_deg is None else math.radians(support_deg)
-            estimate = solve_scarce(
-                problem, nonnegative=nonnegative, support=support, step_deg=step_deg, seed=seed, tell=tell
-            )
-        elif method == "poisson":
-            tell("normal likelihood, then counts")
+
+        def fit(problem: Problem) -> Estimate:
+            if method != "poisson":
+                return solve_noisy(
+                    problem, space, steps or NOISY_STEPS, nonnegative=nonnegative, tolerance=tolerance, tell=tell
+                )
             assert counts_per_radiance is not None
-            estimate = solve_counts(
+            return solve_counts(
                 problem,
                 space,
                 per_radiance=counts_per_radiance,
@@ -165,6 +171,15 @@ def solve(
                 nonnegative=nonnegative,
                 steps=steps or NOISY_STEPS,
                 tell=tell,
+            )
+
+        estimate = exact = None
+        quiet = False
+        if few:
+            tell(f"{captures.realisations} captures for {captures.card.elements} elements: search for few captures")
+            support = None if support_deg is None else math.radians(support_deg)
+            estimate = solve_scarce(
+                problem, nonnegative=nonnegative, support=support, step_deg=step_deg, seed=seed, tell=tell
             )
         elif method == "closed_form" or (method == "auto" and _may_be_exact(problem, space)):
             tell(f"rank {space.rank} of {captures.card.elements}, no noise stated: closed form")
@@ -179,21 +194,26 @@ def solve(
                 why = "its error bound is too large" if quiet else "there is noise"
                 tell(f"closed form misses the data by {exact.closed.mismatch:.1e}: {why}")
         if estimate is None:
-            tell("maximum likelihood")
+            tell("normal likelihood, then counts" if method == "poisson" else "maximum likelihood")
             try:
-                estimate = solve_noisy(
-                    problem, space, steps or NOISY_STEPS, nonnegative=nonnegative, tolerance=tolerance, tell=tell
-                )
+                estimate = fit(problem)
             except UndeterminedError:
                 if not quiet or exact is None:
                     raise
                 estimate = exact  # refused below, and the closed form knows the better reason
+        angle_sum = None
+        if estimate.method in FITS and estimate.predicted_error <= UNDETERMINED:
+            angle_sum = check_angle_sum(problem, estimate)
+            if wall == "microfacet" or (wall == "auto" and angle_sum.rejects(estimate.predicted_error)):
+                problem, estimate, angle_sum = fit_facets(problem, angle_sum, fit, tell)
+            estimate = with_doubt(estimate, angle_sum)
         if calibration is not None:
             tell(f"the same with the card one standard deviation aside, {len(calibration.aside)} times")
             aside = [
                 solve(
                     replace(filmed, card=card),
                     method=cast(Method, estimate.method),
+                    wall="microfacet" if problem.exponents else "angle_sum",
                     nonnegative=nonnegative,
                     support_deg=support_deg,
                     step_deg=math.degrees(estimate.grid.step),
@@ -205,12 +225,25 @@ def solve(
             ]
             estimate = widened(problem, estimate, aside)
         check = check_one_bounce(problem, estimate, wall_albedo=wall_albedo)
-        solution = conclude(problem, space, estimate, check, gauge=gauge, seconds=lambda: time.perf_counter() - started)
+        solution = conclude(
+            problem, space, estimate, check, angle_sum, gauge=gauge, seconds=lambda: time.perf_counter() - started
+        )
         return replace(solution, history=tuple(history))
 
 
 def _may_be_exact(problem: Problem, space: SignalSpace) -> bool:
     return not problem.noise_is_stated and space.rank == problem.card.elements
+
+
+def _check_wall(wall: str, method: str, few: bool, scale: str) -> None:
+    if wall not in get_args(Wall):
+        raise InputError(f'is "{wall}"; choose one of {", ".join(get_args(Wall))}', field="wall")
+    if wall != "angle_sum" and (few or method == "closed_form"):
+        raise InputError(
+            "can be no other than angle_sum in the closed form and for few captures; leave it out", field="wall"
+        )
+    if wall != "angle_sum" and scale == "albedo":
+        raise InputError("can be no other than angle_sum where an albedo settles the scale", field="wall")
 
 
 def _check_options(

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet, Truth, read_captures, read_truth
+from wallmirror.derendering.angle_sum_check import LEVEL, AngleSumCheck
 from wallmirror.derendering.calibration import Calibration, calibrate
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.solution import Solution
@@ -289,11 +290,24 @@ def certificates(solved: Solved) -> TableBlock:
                 + (" (assumed)" if check.assumed else ""),
             )
         )
+    if s.angle_sum_check is not None:
+        rows.append(_of_angle_sum(s.angle_sum_check))
     if solved.judgement is not None:
         rows.append(("true error of the pattern", f"{100 * solved.judgement.source_error:.2g} %", "against the truth"))
         if not math.isnan(solved.judgement.brdf_error):
             rows.append(("true error of the BRDF", f"{100 * solved.judgement.brdf_error:.2g} %", "against the truth"))
     return TableBlock(("certificate", "value", "should be"), tuple(rows))
+
+
+def _of_angle_sum(check: AngleSumCheck) -> tuple[str, str, str]:
+    wall = "Hypothesis 8 (angle sum)"
+    if check.assumed:
+        wall = "a wall of facets: " + ", ".join(f"{k} to the {v:.2f}" for k, v in check.assumed.items())
+    return (
+        f"the films against {wall}",
+        f"p = {check.significance:.2g}",
+        f"above {LEVEL:g}; a wall of more factors turns the pattern by {100 * check.bias:.2g} ± {100 * check.open:.2g} %",
+    )
 
 
 def _expected(value: float) -> str:
