@@ -96,7 +96,7 @@ class Cell:
 def code_of(method: str) -> str:
     """Digest of the modules that a method's numbers come from, as they are when it is first asked for."""
     package = Path(wallmirror.__file__).parent
-    files = [package / f"{name}.py" for name in _FORWARD]
+    files = [path for name in _FORWARD for path in sorted([*package.glob(f"{name}.py"), *package.glob(f"{name}/*.py")])]
     if method in (TEXT, RECORDED):
         files += [package / "derendering" / f"{name}.py" for name in _ALTERNATION]
     else:
