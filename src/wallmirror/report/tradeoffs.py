@@ -119,6 +119,11 @@ def budget_figure(panel: Panel) -> Figure:
                     color=colour, zorder=4, linewidths=1.1, facecolor=None if shape == "x" else "white", edgecolor=None
                     if shape == "x" else colour,
                 )  # fmt: skip
+        refused = [run for run in runs if run.failure]
+        axes.scatter(
+            [run.knobs["realisations"] for run in refused], [1.0] * len(refused), marker="X", s=44, color=INK, clip_on=False,
+            transform=axes.get_xaxis_transform(), zorder=5,
+        )  # fmt: skip
         _log_axes(axes, seconds=False)
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 4)))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
@@ -132,6 +137,7 @@ def budget_figure(panel: Panel) -> Figure:
         axes.set_axis_off()
     fields[0].scatter([], [], marker="x", color=INK, s=26, label=DRAWN)
     fields[0].scatter([], [], marker="D", facecolor="white", edgecolor=INK, s=34, label=RENDERED)
+    fields[0].scatter([], [], marker="X", color=INK, s=44, label="refused, or not affordable")
     figure.legend(frameon=False, fontsize=8.5, loc="outside right upper")
     return figure
 
