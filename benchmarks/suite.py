@@ -258,18 +258,18 @@ def compare(before: dict[str, dict[str, Any]], after: dict[str, dict[str, Any]])
         (was, was_doubt), (is_now, is_doubt) = spread(old["ratios"]), spread(new["ratios"])
         factor, doubt = is_now / was, math.hypot(was_doubt, is_doubt)
         memory = new["peak"] / max(1, old["peak"])
-        slower, hungrier = factor > SLOWER and factor > 1 + 2 * doubt, memory > HUNGRIER
+        changed = abs(math.log(factor)) > max(math.log(SLOWER), 2 * doubt)
+        slower, hungrier = changed and factor > 1, memory > HUNGRIER
         good &= not (slower or hungrier)
-        quicker = factor < 1 / SLOWER and factor < 1 - 2 * doubt
         verdict = " and ".join(w for w, true in (("SLOWER", slower), ("HUNGRIER", hungrier)) if true)
         rows.append(
             [
                 name,
                 f"{was:.3g}",
                 f"{is_now:.3g}",
-                f"{factor:.2f} ± {doubt:.2f}",
+                f"{factor:.2f} ± {100 * doubt:.0f} %",
                 f"{memory:.2f}",
-                verdict or ("quicker" if quicker else "alike"),
+                verdict or ("quicker" if changed else "alike"),
             ]
         )
     return rows, good
