@@ -591,3 +591,30 @@ def test_points_in_a_physical_mirror_are_refused() -> None:
     error = refused(lambda: transport_matrix(thesis_observer(pixels=10, views=1), thesis_card(), Mirror()))
     assert error.field == "card.element_width"
     assert "width and a height" in error.message
+
+
+# -- evaluation in blocks -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("weights", ["thesis", "cosine", "physical"])
+def test_blocks_and_the_whole_kernel_give_the_same_transport(weights: Weights, monkeypatch: pytest.MonkeyPatch) -> None:
+    observer, card = thesis_observer(37, 3, "centres"), thesis_card(elements=5, width=0.02)
+    brdf = Table(values=np.random.default_rng(0).random((9, 7)))
+    for model in (lobes(sigma_deg=3.0), brdf):
+        whole = build_kernel(observer, card, weights=weights, orders=(2, 3)).apply(model)
+        for block in (1, 100, 10**6):
+            monkeypatch.setattr("wallmirror.transport._BLOCK", block)
+            parts = transport_matrix(observer, card, model, weights=weights, orders=(2, 3))
+            # Six products, added in another order.
+            np.testing.assert_allclose(parts, whole, rtol=0, atol=8 * EPS * np.abs(whole).max())
+
+
+def test_orders_that_are_given_are_those_used() -> None:
+    observer, card = thesis_observer(20, 2, "centres"), thesis_card(width=0.02)
+    assert build_kernel(observer, card, orders=(3, 5)).weight.shape[-1] == 15
+    # Points have nothing to integrate over.
+    assert build_kernel(observer, card, weights="cosine", orders=(3, 5)).weight.shape[-1] == 1
+    coarse, fine = (transport_matrix(observer, card, lobes(), orders=(1, s)) for s in (1, 8))
+    assert np.abs(coarse - fine).max() > 1e-2 * fine.max()  # the twin: they matter
+    for orders in ((0, 1), (1, 257)):
+        assert refused(lambda orders=orders: transport_matrix(observer, card, lobes(), orders=orders)).field == "orders"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -28,8 +29,16 @@ _LOOKS = tuple(
 _LOWEST = 1e-16  # errors below float64's own are drawn there
 
 
-def work_precision(runs: Sequence[Run], *, title: str, floor: float | None = None, floor_name: str = "") -> Figure:
-    """Error over processor seconds, a line a method; grey: the front of all runs; crosses at the top: failures."""
+def work_precision(runs: Sequence[Run], *, title: str, over_bound: bool = False) -> Figure:
+    """Error over processor seconds, a line a method; grey: the front of all runs; crosses at the top: failures.
+
+    Parameters
+    ----------
+    over_bound:
+        Draw errors in units of each run's own Cramér-Rao bound.
+    """
+    if over_bound:
+        runs = [replace(run, error=run.error / run.extra["bound"]) for run in runs]
     lines = by_method(runs)
     figure = new_figure(10.5, 4.2 if len(lines) < 7 else 5.8)
     axes = figure.add_subplot()
@@ -56,11 +65,11 @@ def work_precision(runs: Sequence[Run], *, title: str, floor: float | None = Non
         axes.scatter(x, y, s=26, marker=mark, color=colour, zorder=3, label=label, linewidths=0)
         fallen = [run for run in line if run.failure and math.isfinite(run.seconds)]
         axes.scatter([run.seconds for run in fallen], [top] * len(fallen), s=40, marker="x", color=colour, zorder=4)
-    if floor is not None:
-        axes.axhline(floor, color=INK, linewidth=0.9, linestyle=(0, (5, 3)), label=floor_name)
+    if over_bound:
+        axes.axhline(1.0, color=INK, linewidth=0.9, linestyle=(0, (5, 3)), label="Cramér-Rao bound")
     _log_axes(axes)
     axes.set_xlabel("processor seconds")
-    axes.set_ylabel("relative error")
+    axes.set_ylabel("error / bound of its captures" if over_bound else "relative error")
     axes.set_title(title, fontsize=11, color=INK, loc="left")
     figure.legend(frameon=False, fontsize=8.5, loc="outside right upper")
     clean(axes)
@@ -78,12 +87,11 @@ def panel_figures(panel: Panel) -> list[tuple[Figure, str]]:
     figures = []
     for group in panel.groups:
         runs = panel.of_group(group)
-        floor = panel.floors.get(group)
         failed = sum(1 for run in runs if run.failure)
         caption = f"{group}: {len(runs)} runs"
         caption += f", {failed} of which failed (crosses at the top)" if failed else ", none failed"
         caption += ". Each line joins the runs of a method that the method itself does not beat; dots are all its runs."
-        figures.append((work_precision(runs, title=group, floor=floor, floor_name="Cramér-Rao bound"), caption))
+        figures.append((work_precision(runs, title=group, over_bound=group in panel.floors), caption))
     return figures
 
 
@@ -111,9 +119,16 @@ def budget_figure(panel: Panel) -> Figure:
                     color=colour, zorder=4, linewidths=1.1, facecolor=None if shape == "x" else "white", edgecolor=None
                     if shape == "x" else colour,
                 )  # fmt: skip
+        refused = [run for run in runs if run.failure]
+        axes.scatter(
+            [run.knobs["realisations"] for run in refused], [1.0] * len(refused), marker="X", s=44, color=INK, clip_on=False,
+            transform=axes.get_xaxis_transform(), zorder=5,
+        )  # fmt: skip
         _log_axes(axes, seconds=False)
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 4)))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{100 * v:g} %"))
         axes.set_xlabel("realisations B")
         axes.set_ylabel("error of the patterns")
         axes.set_title(group, fontsize=10.5, color=INK, loc="left")
@@ -122,6 +137,7 @@ def budget_figure(panel: Panel) -> Figure:
         axes.set_axis_off()
     fields[0].scatter([], [], marker="x", color=INK, s=26, label=DRAWN)
     fields[0].scatter([], [], marker="D", facecolor="white", edgecolor=INK, s=34, label=RENDERED)
+    fields[0].scatter([], [], marker="X", color=INK, s=44, label="refused, or not affordable")
     figure.legend(frameon=False, fontsize=8.5, loc="outside right upper")
     return figure
 

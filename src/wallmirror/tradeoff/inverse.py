@@ -289,7 +289,7 @@ def _rows(runs: Sequence[Run]) -> list[dict[str, str]]:
                     "noise": level,
                     "method": method,
                     "setting": best or "-",
-                    "error": f"{error:.2e}" if good else "-",
+                    "error": f"{100 * error:.3g} %" if good else "-",
                     "over the bound": f"{error / floor:.3g}" if good else "-",
                     "seconds": short_seconds(float(np.median([run.seconds for run in at]))),
                     "failed": f"{failed} of {len(line)}",
