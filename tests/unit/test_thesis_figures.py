@@ -43,6 +43,11 @@ def test_ids_are_in_the_order_of_the_thesis_and_each_names_its_own_figure():
     assert make_figure("2.10").id == "2.10"
 
 
+def test_every_figure_of_chapters_1_to_3_is_there():
+    wanted = {f"1.{n}" for n in range(1, 6)} | {f"2.{n}" for n in range(1, 13)} | {f"3.{n}" for n in range(1, 15)}
+    assert wanted <= set(figure_ids())
+
+
 def test_csv_holds_every_column_whole():
     rows = list(csv.reader(io.StringIO(a_figure().to_csv())))
     assert rows == [["x (m)", "y"], ["0.0", "1.0"], ["1.0", ""], ["2.0", ""]]
@@ -70,7 +75,13 @@ def test_gallery_shows_claims_beside_numbers(tmp_path):
 
 def test_files_of_one_figure(tmp_path):
     (made,) = make_figures(["2.10"], tmp_path)
-    assert {p.name for p in tmp_path.iterdir()} == {"fig_2.10.png", "fig_2.10.csv", "gallery.html", "results.json"}
+    assert {p.name for p in tmp_path.iterdir()} == {
+        "fig_2.10.png",
+        "fig_2.10.csv",
+        "gallery.html",
+        "claims.md",
+        "results.json",
+    }
     assert (tmp_path / "fig_2.10.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads((tmp_path / "results.json").read_text())[0]["numbers"] == dict(made.figure.numbers)
 

@@ -42,7 +42,7 @@ class Made:
 
 
 def make_figures(ids: Sequence[str], out: Path, *, seed: int = 0, progress: Advance | None = None) -> list[Made]:
-    """Make the named figures, or all, and write each as PNG and CSV, with gallery.html and results.json.
+    """Make the named figures, or all, and write each as PNG and CSV, with gallery.html, claims.md and results.json.
 
     Parameters
     ----------
@@ -70,20 +70,41 @@ def make_figures(ids: Sequence[str], out: Path, *, seed: int = 0, progress: Adva
         if progress is not None:
             progress(number, len(chosen))
     write_atomically(out / "results.json", json.dumps([m.summary() for m in made], indent=1, allow_nan=False) + "\n")
+    write_atomically(out / "claims.md", claims_page(made))
     write_gallery(made, out / "gallery.html")
     return made
+
+
+def claims_page(made: Sequence[Made]) -> str:
+    """The thesis's claims beside our numbers as Markdown, for a repository."""
+    rows = [(m.figure.id, c.thesis, c.outcome, c.measured) for m in made for c in m.figure.claims]
+    lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
+    return "\n".join(
+        [
+            "# The thesis's claims, chapters 1 to 3",
+            "",
+            f"{_counted(made)} Made by `wallmirror figures`, whose gallery shows each figure; an outcome is computed from the "
+            "numbers of the run.",
+            "",
+            "| figure | the thesis | verdict | measured |",
+            "|---|---|---|---|",
+            *lines,
+            "",
+        ]
+    )
+
+
+def _counted(made: Sequence[Made]) -> str:
+    """How many claims came out how, in a sentence."""
+    counted = Counter(claim.outcome for m in made for claim in m.figure.claims)
+    told = ", ".join(f"{counted[outcome]} {outcome}" for outcome in get_args(Outcome) if counted[outcome])
+    return f"{counted.total()} claim{'s' if counted.total() != 1 else ''} of the thesis: {told}."
 
 
 def write_gallery(made: Sequence[Made], path: Path) -> None:
     """The page with every figure, its numbers, and the thesis's claims beside the measured ones."""
     claims = [(m.figure, claim) for m in made for claim in m.figure.claims]
-    counted = Counter(claim.outcome for _, claim in claims)
-    told = ", ".join(f"{counted[outcome]} {outcome}" for outcome in get_args(Outcome) if counted[outcome])
-    verdicts = (
-        [Verdict(None, f"{len(claims)} claim{'s' if len(claims) != 1 else ''} of the thesis: {told}.")]
-        if claims
-        else []
-    )
+    verdicts = [Verdict(None, _counted(made))] if claims else []
     table = TableBlock(
         ("figure", "the thesis", "verdict", "measured"),
         tuple((figure.id, claim.thesis, claim.outcome, claim.measured) for figure, claim in claims),
