@@ -178,6 +178,7 @@ def test_facets_are_told_and_fitted_to_within_the_bars(facets: str, noise: float
     assert scale_free_error(better.source, SOURCE) < min(3 * better.predicted_error, off)
     assert better.angle_sum_check is not None
     assert set(better.angle_sum_check.assumed) == set(FITTED)
+    assert "given a wall of facets, foreshortening to the" in better.status
     assert better.summary()["angle_sum_check"] == asdict(better.angle_sum_check)
 
 

@@ -17,8 +17,9 @@ what the captures cannot tell of them must not count as known: what is left of i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -198,7 +199,7 @@ def fit_facets(
     """
     for _ in range(_ROUNDS):
         problem = replace(problem, exponents={k: check.exponents[k] for k in FITTED})
-        tell(f"wall of facets: {in_words(problem.exponents)}")
+        tell(f"a wall of facets, {in_words(problem.exponents)}")
         estimate = fit(problem)
         check = check_angle_sum(problem, estimate)
         if check.bias < _SETTLED * math.hypot(estimate.predicted_error, check.open):
@@ -206,7 +207,7 @@ def fit_facets(
     return problem, estimate, check_angle_sum(problem, estimate, EVERY)
 
 
-def in_words(exponents: dict[Factor, float]) -> str:
+def in_words(exponents: Mapping[Any, float]) -> str:
     """The factors and their exponents."""
     return ", ".join(f"{factor} to the {exponent:.2f}" for factor, exponent in exponents.items())
 
@@ -239,6 +240,7 @@ def with_doubt(estimate: Estimate, check: AngleSumCheck) -> Estimate:
             f"would be about {100 * check.open:.2g} % off, and the error bars were widened to that; use more pixels or "
             "views, or more light",
         )
+    rests_on = (f"a wall of facets, {in_words(check.assumed)}",) if check.assumed else ()
     ratio = whole / predicted if predicted > 0 else 1.0
     return replace(
         estimate,
@@ -247,4 +249,5 @@ def with_doubt(estimate: Estimate, check: AngleSumCheck) -> Estimate:
         shape_std=ratio * estimate.shape_std,
         brdf_std=lambda u: ratio * estimate.brdf_std(u),
         warnings=(*warnings, *estimate.warnings),
+        priors=(*estimate.priors, *rests_on),
     )

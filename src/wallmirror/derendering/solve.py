@@ -31,14 +31,14 @@ from wallmirror.derendering.subspace import SignalSpace
 from wallmirror.errors import InputError, UndeterminedError
 
 Method = Literal["auto", "closed_form", "maximum_likelihood", "few_captures", "poisson"]
-Wall = Literal["angle_sum", "microfacet", "auto"]
+WallModel = Literal["angle_sum", "microfacet", "auto"]
 
 
 class SolveOptions(TypedDict, total=False):
     """The options of `solve`, for functions that hand them on."""
 
     method: Method
-    wall: Wall
+    wall: WallModel
     nonnegative: bool
     support_deg: float | None
     step_deg: float | None
@@ -63,7 +63,7 @@ def solve(
     captures: CaptureSet,
     *,
     method: Method = "auto",
-    wall: Wall = "angle_sum",
+    wall: WallModel = "angle_sum",
     nonnegative: bool = True,
     support_deg: float | None = None,
     step_deg: float | None = None,
@@ -236,8 +236,8 @@ def _may_be_exact(problem: Problem, space: SignalSpace) -> bool:
 
 
 def _check_wall(wall: str, method: str, few: bool, scale: str) -> None:
-    if wall not in get_args(Wall):
-        raise InputError(f'is "{wall}"; choose one of {", ".join(get_args(Wall))}', field="wall")
+    if wall not in get_args(WallModel):
+        raise InputError(f'is "{wall}"; choose one of {", ".join(get_args(WallModel))}', field="wall")
     if wall != "angle_sum" and (few or method == "closed_form"):
         raise InputError(
             "can be no other than angle_sum in the closed form and for few captures; leave it out", field="wall"
