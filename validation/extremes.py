@@ -29,7 +29,8 @@ from wallmirror.convolution import angle_convolution, spherical_convolution
 from wallmirror.files import write_atomically
 from wallmirror.geometry import incident_angles, pixel_half_width, pixel_tangents
 from wallmirror.jobs.validating import validate_scene
-from wallmirror.transport import quadrature_order, strip_factor
+from wallmirror.quadrature import quadrature_order
+from wallmirror.transport import strip_factor
 
 HERE = Path(__file__).parent
 DIGITS = 50

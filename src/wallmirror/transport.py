@@ -15,7 +15,6 @@ applies it to a known BRDF. The weight G is
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 from dataclasses import dataclass, replace
@@ -23,7 +22,6 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import erf
 
 from wallmirror.brdf import BRDF, AngleSumBRDF, Mirror
 from wallmirror.errors import InputError
@@ -38,13 +36,13 @@ from wallmirror.geometry import (
     wall_points,
 )
 from wallmirror.memory import kernel_bytes, require_memory, transport_bytes
+from wallmirror.quadrature import MAX_ORDER, gauss_legendre, quadrature_order
 
 #: What stands in front of the BRDF; see the module's text.
 Weights = Literal["thesis", "cosine", "physical"]
 
 _PARTS = 4  # of a pixel or strip, over which the speed of u is measured
 _WEIGHT_SCALE = 0.35  # radians
-_MAX_ORDER = 256
 _BLOCK = 1 << 14  # nodes: their dozen temporary arrays stay in a cache of 2 MB
 
 
@@ -168,9 +166,9 @@ def transport_matrix(
     # The orders are those for Gaussian lobes; half as many again must agree on this BRDF and this geometry.
     while nodes.half_pixel > 0 or nodes.half_strip > 0:
         orders = _more(orders[0], nodes.half_pixel), _more(orders[1], nodes.half_strip)
-        if max(orders) > _MAX_ORDER:
+        if max(orders) > MAX_ORDER:
             raise InputError(
-                f"a strip or pixel needs more than {_MAX_ORDER} quadrature nodes to reach {tolerance:g}; narrow the "
+                f"a strip or pixel needs more than {MAX_ORDER} quadrature nodes to reach {tolerance:g}; narrow the "
                 "strips, use more pixels or accept a larger tolerance",
                 field="card.element_width",
             )
@@ -278,49 +276,6 @@ def strip_factor(distance: float, dx: ArrayLike, low: ArrayLike, high: ArrayLike
     return antiderivative(high) - antiderivative(low)
 
 
-def quadrature_order(width: float, tolerance: float) -> int:
-    """Smallest Gauss-Legendre order that averages exp(-u^2/2) over an interval of `width` to `tolerance`.
-
-    Parameters
-    ----------
-    width:
-        Length of the interval in standard deviations of the lobe; the worst offset of the lobe counts.
-    """
-    if width <= 0:
-        return 1
-    # Lobes every quarter of their width, so that none slips between the nodes unseen.
-    offsets = np.linspace(0.0, width / 2 + 4.0, 33 + int(2 * width))
-    reference = _lobe_average(width, offsets)
-    for order in range(1 + int(width / 4), _MAX_ORDER + 1):  # nodes further apart than the lobe's width see nothing
-        nodes, weights = _gauss_legendre(order)
-        values = np.exp(-0.5 * (offsets[:, None] + 0.5 * width * nodes) ** 2) @ (0.5 * weights)
-        if np.max(np.abs(values - reference)) <= tolerance:
-            return order
-    raise InputError(
-        f"a strip or pixel spans {width:.3g} lobe widths of the BRDF, more than {_MAX_ORDER} quadrature nodes resolve "
-        f"to {tolerance:g}; narrow the strips, use more pixels or accept a larger tolerance",
-        field="card.element_width",
-    )
-
-
-@functools.cache
-def _gauss_legendre(order: int) -> tuple[Array, Array]:
-    """Nodes and weights on [-1, 1], kept: a search for the card asks for the same ones hundreds of times."""
-    nodes, weights = np.polynomial.legendre.leggauss(order)
-    nodes.setflags(write=False)
-    weights.setflags(write=False)
-    return nodes, weights
-
-
-def _lobe_average(width: float, offsets: Array) -> Array:
-    """Exact average of exp(-u^2/2) over [offset - width/2, offset + width/2]."""
-    ends = (offsets[:, None] + 0.5 * width * np.array([1.0, -1.0])) / math.sqrt(2)
-    if width < 1e-3:  # the difference of two erf would cancel
-        return np.exp(-0.5 * offsets**2) * (1 + (offsets**2 - 1) * width**2 / 24)
-    difference = erf(ends[:, 0]) - erf(ends[:, 1])
-    return np.asarray(math.sqrt(math.pi / 2) * difference / width, dtype=np.float64)
-
-
 def _extent_in_angle(observer: Observer, card: Card, half_pixel: float, half_strip: float) -> tuple[float, float]:
     """What one pixel and one strip would span in u, in radians, if u ran everywhere as fast as where it is fastest.
 
@@ -377,8 +332,8 @@ class _Nodes:
 
     def checked(self, orders: tuple[int, int]) -> tuple[int, int]:
         """Orders that somebody asked for, 1 where there is nothing to integrate over."""
-        if not all(1 <= order <= _MAX_ORDER for order in orders):
-            raise InputError(f"are {orders}; give 1 to {_MAX_ORDER} nodes across pixel and strip", field="orders")
+        if not all(1 <= order <= MAX_ORDER for order in orders):
+            raise InputError(f"are {orders}; give 1 to {MAX_ORDER} nodes across pixel and strip", field="orders")
         return orders[0] if self.half_pixel > 0 else 1, orders[1] if self.half_strip > 0 else 1
 
     def transport(self, orders: tuple[int, int], brdf: BRDF) -> Array:
@@ -422,8 +377,8 @@ class _Nodes:
 
     def _rule(self, orders: tuple[int, int]) -> tuple[Array, Array, Array]:
         """Offsets of the nodes across pixel (in tangents) and strip (in metres), and their weights, which sum to 1."""
-        pixel_nodes, pixel_weights = _gauss_legendre(orders[0])
-        strip_nodes, strip_weights = _gauss_legendre(orders[1])
+        pixel_nodes, pixel_weights = gauss_legendre(orders[0])
+        strip_nodes, strip_weights = gauss_legendre(orders[1])
         average = 0.5 * pixel_weights[:, None] * (0.5 * strip_weights)
         return self.half_pixel * pixel_nodes, self.half_strip * strip_nodes, average
 

@@ -16,12 +16,12 @@ from scipy import integrate
 from wallmirror.brdf import BRDF, Diffuse, GaussianTrain, Mirror, Sum, Table
 from wallmirror.errors import InputError
 from wallmirror.geometry import Card, Observer, outgoing_angles, pixel_half_width, pixel_tangents, wall_points
+from wallmirror.quadrature import quadrature_order
 from wallmirror.transport import (
     Weights,
     brdf_matrices,
     build_kernel,
     mirror_matrix,
-    quadrature_order,
     radiance,
     strip_factor,
     transport_matrix,
