@@ -13,7 +13,7 @@ import pytest
 import scipy.stats
 from numpy.typing import NDArray
 
-from wallmirror.brdf import AngleSumBRDF, AngleSumTable, Diffuse, directional_albedo
+from wallmirror.brdf import AngleSumBRDF, AngleSumTable, Diffuse, GaussianTrain, directional_albedo
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.components import components
 from wallmirror.derendering.estimate import scale_free_error
@@ -550,3 +550,20 @@ def test_history_says_what_was_done_and_why() -> None:
     quiet = gauged(noise=0.0)
     assert "no noise stated: closed form" in quiet.history[0]
     assert quiet.method == "closed_form"
+
+
+@pytest.mark.parametrize(("distance", "verdict"), [(1e-2, "doubtful"), (1.0, "good")])
+def test_a_rival_brdf_that_fits_as_well_is_told(distance: float, verdict: str) -> None:
+    # An observer so close to the wall sees it from all sides of one point: every element shows the same window of the
+    # BRDF, moved, and films that differ by rounding have patterns that differ by half. From 1 m away nothing is amiss.
+    observer = Observer(position=(0.0, -distance), fov=math.radians(60), view_angles=(0.26, 0.0, -0.26), pixels=200)
+    card = Card(elements_x=(-1.0, 0.2, 1.1), y=-1.0)
+    source = np.random.default_rng(3).random((3, 6))
+    brdf = GaussianTrain(centres=(math.radians(-15), math.radians(15)), sigma=math.radians(5))
+    films = radiance(transport_matrix(observer, card, brdf, weights="cosine"), source)
+    solution = solve(CaptureSet(observer=observer, card=card, transport="cosine", radiance=films))
+    assert solution.verdict == verdict
+    assert ("another BRDF" in solution.status) == (verdict == "doubtful")
+    # The twin: without the warning the answer would be called good although it is far beyond its error bars.
+    error = scale_free_error(solution.source, source)
+    assert (error > 5 * solution.predicted_error + 1e-6) == (verdict == "doubtful")
