@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -44,6 +45,7 @@ Weights = Literal["thesis", "cosine", "physical"]
 _PARTS = 4  # of a pixel or strip, over which the speed of u is measured
 _WEIGHT_SCALE = 0.35  # radians
 _BLOCK = 1 << 14  # nodes: their dozen temporary arrays stay in a cache of 2 MB
+_ROW = 256  # pixels of a block at least, since NumPy is slow over short rows
 
 
 @dataclass(frozen=True)
@@ -173,7 +175,7 @@ def transport_matrix(
                 field="card.element_width",
             )
         fine = nodes.transport(orders, brdf)
-        largest = np.max(np.abs(fine), initial=0.0)
+        largest = max(float(fine.max(initial=0.0)), -float(fine.min(initial=0.0)))
         np.subtract(coarse, fine, out=coarse)
         if np.max(np.abs(coarse, out=coarse), initial=0.0) <= tolerance * largest:
             return fine
@@ -287,16 +289,25 @@ def _extent_in_angle(observer: Observer, card: Card, half_pixel: float, half_str
     t = pixel_tangents(observer)
     strips = np.asarray(card.elements_x)
     pixel = strip = 0.0
-    some = max(1, _BLOCK // (t.size * strips.size))
-    for a in range(0, observer.views, some):
-        part = replace(observer, view_angles=observer.view_angles[a : a + some])
-        across = wall_points(part, t[:, None] + half_pixel * parts)[..., None]
-        u = outgoing_angles(part, across) + incident_angles(strips, card.distance, across)
+    for views, pixels, elements in _blocks(observer.views, t.size, strips.size):
+        part, sources = replace(observer, view_angles=observer.view_angles[views]), strips[elements]
+        across = wall_points(part, t[pixels, None] + half_pixel * parts)[..., None]
+        u = outgoing_angles(part, across) + incident_angles(sources, card.distance, across)
         pixel = max(pixel, _PARTS * float(np.abs(np.diff(u, axis=2)).max()))
         centre = across[:, :, _PARTS // 2]
-        ends = (incident_angles(strips + half_strip * node, card.distance, centre) for node in parts)
+        ends = (incident_angles(sources + half_strip * node, card.distance, centre) for node in parts)
         strip = max(strip, _PARTS * max(float((right - left).max()) for left, right in itertools.pairwise(ends)))
     return pixel, strip
+
+
+def _blocks(views: int, pixels: int, elements: int) -> Iterator[tuple[slice, slice, slice]]:
+    """Parts of (A, N, M) of about `_BLOCK` entries each, whole rows of pixels where they fit."""
+    some_elements = min(elements, max(1, _BLOCK // _ROW))
+    rest = max(1, _BLOCK // some_elements)
+    some_views, some_pixels = max(1, rest // pixels), min(rest, pixels)
+    steps = ((views, some_views), (pixels, some_pixels), (elements, some_elements))
+    for a, j, i in itertools.product(*(range(0, size, step) for size, step in steps)):
+        yield slice(a, a + some_views), slice(j, j + some_pixels), slice(i, i + some_elements)
 
 
 @dataclass(frozen=True)
@@ -337,28 +348,25 @@ class _Nodes:
         return orders[0] if self.half_pixel > 0 else 1, orders[1] if self.half_strip > 0 else 1
 
     def transport(self, orders: tuple[int, int], brdf: BRDF) -> Array:
-        """F, node by node, over blocks of pixels that stay in a processor's cache."""
-        views, pixels, elements = self.observer.views, self.observer.pixels, self.card.elements
-        block = max(1, _BLOCK // elements)
-        some_views, some_pixels = max(1, block // pixels), min(block, pixels)
+        """F, node by node, over blocks of pixels and elements that stay in a processor's cache."""
         of_pixel, of_strip, average = self._rule(orders)
-        transport = np.empty((views, pixels, elements))
+        t = pixel_tangents(self.observer)
+        transport = np.empty((self.observer.views, t.size, self.card.elements))
         source_x = np.asarray(self.card.elements_x)[:, None, None, None] + of_strip  # axes: (M, A, N), node
-        for a, j in itertools.product(range(0, views, some_views), range(0, pixels, some_pixels)):
-            part = slice(a, a + some_views), slice(j, j + some_pixels)
-            observer = replace(self.observer, view_angles=self.observer.view_angles[part[0]])
-            t = pixel_tangents(observer)[part[1]]
-            sums = np.zeros((elements, observer.views, t.size))
+        for block in _blocks(*transport.shape):
+            observer = replace(self.observer, view_angles=self.observer.view_angles[block[0]])
+            part, sources = t[block[1]], source_x[block[2]]
+            sums = np.zeros((len(sources), observer.views, part.size))
             for p, across in enumerate(of_pixel):
-                seen = self._seen(observer, t + across)
+                seen = self._seen(observer, part + across)
                 for s in range(of_strip.size):
-                    theta_s, theta_o, weight = self._transported(*seen, source_x[..., s])
+                    theta_s, theta_o, weight = self._transported(*seen, sources[..., s])
                     rho = brdf.of_sum(theta_s + theta_o) if isinstance(brdf, AngleSumBRDF) else brdf(theta_s, theta_o)
                     if weight is not None:
                         rho *= weight
                     rho *= average[p, s]
                     sums += rho
-            transport[part] = np.moveaxis(sums, 0, -1)
+            transport[block] = np.moveaxis(sums, 0, -1)
         return transport
 
     def kernel(self, orders: tuple[int, int]) -> Kernel:

@@ -68,6 +68,13 @@ def test_a_transport_matrix_takes_what_is_foretold_whatever_its_quadrature() -> 
         assert used <= foretold <= ROOM * used
 
 
+def test_one_wide_view_takes_no_more_than_its_share() -> None:
+    # Whatever is looked for before F, such as the widest turn in one pixel, goes through the pixels in blocks as well.
+    observer, card = thesis_observer(40_000, 1, "centres"), thesis_card(elements=16, width=0.02)
+    used = peak(lambda: transport_matrix(observer, card, LOBES, tolerance=1e-3))
+    assert used <= memory.transport_bytes(1, 40_000, 16)
+
+
 def test_preparing_captures_takes_what_is_foretold() -> None:
     captures = films(thesis_observer(500, 20), 60, noise=0.01)
     foretold = memory.film_bytes(20, 500, 60)

@@ -15,14 +15,16 @@ from wallmirror.report.style import FAINT, INK, OURS, PALE, WARM, clean, new_fig
 from wallmirror.tradeoff.budget import DRAWN, FORETOLD, RENDERED
 from wallmirror.tradeoff.pareto import fit_line, pareto_front, short_seconds
 from wallmirror.tradeoff.runs import Panel, Run, by_method
+from wallmirror.tradeoff.scaling import TRACER
 
-#: Colours and marks of up to a dozen lines, told apart without colour as well.
+#: Colours and marks of up to sixteen lines, told apart without colour as well.
 _LOOKS = tuple(
     (colour, mark)
     for mark, colours in (
         ("o", (OURS, WARM, "#2e8b57", "#8250b4")),
         ("s", ("#0a8a9f", "#b5179e", "#7a6a00", "#5b6572")),
         ("^", ("#74a9e8", "#e5966f", "#8cc6a3", "#bda4d9")),
+        ("D", ("#22272e", "#a40e26", "#116329", "#9a6700")),
     )
     for colour in colours
 )
@@ -88,7 +90,7 @@ def panel_figures(panel: Panel) -> list[tuple[Figure, str]]:
     for group in panel.groups:
         runs = panel.of_group(group)
         failed = sum(1 for run in runs if run.failure)
-        caption = f"{group}: {len(runs)} runs"
+        caption = f"{group[0].upper() + group[1:]}: {len(runs)} runs"
         caption += f", {failed} of which failed (crosses at the top)" if failed else ", none failed"
         caption += ". Each line joins the runs of a method that the method itself does not beat; dots are all its runs."
         figures.append((work_precision(runs, title=group, over_bound=group in panel.floors), caption))
@@ -164,7 +166,7 @@ def scaling_figures(panel: Panel) -> list[tuple[Figure, str]]:
         for axes, name in ((time_axes, "processor seconds"), (memory_axes, "memory taken (GB)")):
             _log_axes(axes, seconds=name.startswith("processor"))
             axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g} x"))
-            axes.set_xlabel("size, in that of the thesis")
+            axes.set_xlabel("pixels, in those of 64 x 64" if group == TRACER else "size, in that of the thesis")
             axes.set_ylabel(name)
             axes.legend(frameon=False, fontsize=8.5)
             clean(axes)

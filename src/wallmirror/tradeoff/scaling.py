@@ -35,6 +35,7 @@ MACHINE_GB = 16.0
 MODEL, SOLVER, TRACER = "physical model", "solve (maximum likelihood)", "Mitsuba picture"
 _SMALL = 20e6  # bytes: below it a process's memory is its allocator's business more than ours
 _TAIL = 4
+_CLEAR = 0.8  # exponent below which memory is still what does not grow
 
 
 @dataclass(frozen=True)
@@ -244,8 +245,8 @@ class Law:
 
     @property
     def room(self) -> float | None:
-        """Size, in that of the thesis, at which the memory of `MACHINE_GB` is full."""
-        return None if self.memory is None or self.memory.slope <= 0.1 else self.memory.where(MACHINE_GB * 1e9)
+        """Size, in that of the thesis, at which the memory of `MACHINE_GB` is full; None where it grows with no clear law."""
+        return None if self.memory is None or self.memory.slope < _CLEAR else self.memory.where(MACHINE_GB * 1e9)
 
 
 def _laws(runs: Sequence[Run]) -> list[Law]:
@@ -289,8 +290,7 @@ def conclude(laws: Sequence[Law]) -> list[Statement]:
         parts = [f"{law.sweep.group}, {law.sweep.method}: {law.seconds.slope:.2f}" for law in others if law.seconds]
         statements.append(Statement(f"Seconds of the others grow with {'; '.join(parts)}."))
     rooms = [
-        f"{law.room * (law.sweep.start if law.sweep.kind != 'picture' else 1):,.2g} "
-        f"{law.sweep.unit if law.sweep.kind != 'picture' else 'times 64 x 64 pixels'} ({law.sweep.group})"
+        f"{law.room * law.sweep.start:,.2g} {law.sweep.unit} ({law.sweep.group})"
         for law in laws
         if law.room is not None
     ]
