@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 #: What becomes of the signal's border: see the module's text.
 Mode = Literal["full", "same", "periodic"]
 
-_WORTH_THREADS = 1 << 16  # samples of a transform
+_WORTH_THREADS = 1 << 18  # samples of a transform
 
 
 class Convolution(LinearOperator):  # type: ignore[misc]

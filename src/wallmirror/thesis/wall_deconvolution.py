@@ -14,7 +14,7 @@ from wallmirror.brdf import AngleSumBRDF
 from wallmirror.convolution.angle import convolution_variable, mirror_directions, mirror_points, resample
 from wallmirror.convolution.as_published import box_mirror_render
 from wallmirror.convolution.wall import wall_kernel
-from wallmirror.deconvolution import Convolution, richardson_lucy, tikhonov_dense, tikhonov_lsmr, toeplitz_matrix
+from wallmirror.deconvolution import Convolution, richardson_lucy, tikhonov_lsmr, toeplitz_matrix
 from wallmirror.geometry import Observer, wall_points
 from wallmirror.report.style import FAINT, OURS, WARM, clean, new_figure
 from wallmirror.thesis import setting
@@ -237,7 +237,7 @@ def transpose(seed: int) -> ThesisFigure:
         for axes, (way, used) in zip(
             panels, {"H": matrix, "H and its transpose exchanged": matrix.T}.items(), strict=True
         ):
-            estimate = tikhonov_dense(used, matrix @ mirror, _ALPHA)
+            estimate = tikhonov_lsmr(used, matrix @ mirror, _ALPHA)
             found[name, way] = find_peaks(x, estimate, places)
             columns |= {"x (m)": x, f"{name}, {way}": estimate}
             _draw(axes, x, estimate, places, (-5, 5), colour=OURS if way == "H" else WARM)
