@@ -295,6 +295,7 @@ def detectable_gain(
     A gain's scatter over S seeds is known to 1 / sqrt(2 S - 2) only. Pixels scatter on their own, so that the sum of
     their squared shares knows it far better.
     """
+    seeds, reference = in_its_unit(reference, seeds, reference)
     keep = reference > _STARVED * float(reference.max(initial=0.0))
     if edges is not None:
         keep &= ~edges

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from wallmirror.comparison import SIGNIFICANCE, BiasTest, Comparison, compare
+from wallmirror.comparison import SIGNIFICANCE, BiasTest, Comparison, compare, detectable_gain
 from wallmirror.errors import InputError
 
 from .helpers import refused
@@ -425,3 +425,5 @@ def test_the_verdict_knows_no_unit(power: int) -> None:
     plain = compare(seeds, reference)
     scaled = compare(np.ldexp(seeds, power), np.ldexp(reference, power))
     assert scaled.summary() == plain.summary()
+    foretold = [detectable_gain(np.ldexp(seeds, p), np.ldexp(reference, p), planned=32) for p in (0, power)]
+    assert foretold[0] == foretold[1]

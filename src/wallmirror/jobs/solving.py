@@ -179,15 +179,25 @@ def write_solution(out: Path, solved: Solved) -> None:
             *solution_sections(solved),
         ],
     )
-    document = json.dumps(solved.summary(), indent=2, allow_nan=False)
+    write_results(
+        out,
+        source=source_csv(solution.source, solution.source_std),
+        brdf=_brdf_csv(solution),
+        page=page,
+        summary=solved.summary(),
+    )
+
+
+def write_results(out: Path, *, source: str, brdf: str, page: str, summary: dict[str, Any]) -> None:
+    """Write the four files of a solution, all or none of them: source.csv, brdf.csv, report.html and solution.json."""
     write_together(
         out,
         {
-            "source.csv": source_csv(solution.source, solution.source_std),
-            "brdf.csv": _brdf_csv(solution),
+            "source.csv": source,
+            "brdf.csv": brdf,
             "report.html": page,
             # Last, so that its presence says that the rest is complete.
-            "solution.json": document + "\n",
+            "solution.json": json.dumps(summary, indent=2, allow_nan=False) + "\n",
         },
     )
 

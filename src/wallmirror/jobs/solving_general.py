@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,8 +14,7 @@ from numpy.typing import NDArray
 from wallmirror.captures import CaptureSet, read_captures, read_truth
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.general import GeneralSolution, solve_general
-from wallmirror.files import write_together
-from wallmirror.jobs.solving import csv_text, source_csv
+from wallmirror.jobs.solving import csv_text, source_csv, write_results
 from wallmirror.report import FigureBlock, Section, TableBlock, Verdict, page_html
 from wallmirror.report.figures import recovered_source, recovered_table, scene_plan
 
@@ -126,16 +124,12 @@ def _write(out: Path, solved: GeneralSolved) -> None:
             Section("How far to trust it", (_certificates(solved),)),
         ],
     )
-    document = json.dumps(solved.summary(), indent=2, allow_nan=False)
-    write_together(
+    write_results(
         out,
-        {
-            "source.csv": source_csv(s.source, s.source_std),
-            "brdf.csv": _table_csv(s),
-            "report.html": page,
-            # Last, so that its presence says that the rest is complete.
-            "solution.json": document + "\n",
-        },
+        source=source_csv(s.source, s.source_std),
+        brdf=_table_csv(s),
+        page=page,
+        summary=solved.summary(),
     )
 
 
