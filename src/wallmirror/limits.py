@@ -42,7 +42,7 @@ def require_affordable(shape: tuple[int, ...], names: tuple[str, ...], *, field:
         )
 
 
-def size_text(size: int) -> str:
+def size_text(size: float) -> str:
     """A number of bytes as people say it: 1.07 GB.
 
     Examples
@@ -53,4 +53,4 @@ def size_text(size: int) -> str:
     for power, unit in ((1e18, "EB"), (1e15, "PB"), (1e12, "TB"), (1e9, "GB"), (1e6, "MB")):
         if size >= power:
             return f"{size / power:.3g} {unit}"
-    return f"{size} bytes"
+    return f"{size:.0f} bytes"

@@ -11,6 +11,7 @@ import os
 from pathlib import Path
 
 from wallmirror.errors import InputError
+from wallmirror.limits import size_text
 
 #: Environment variable that lowers (or raises) the limit, in GB of 1e9 bytes.
 LIMIT_VARIABLE = "WALLMIRROR_MEMORY_GB"
@@ -68,12 +69,12 @@ def require_memory(needed: float, what: str) -> None:
     >>> require_memory(1e18, "F of too many pixels")  # doctest: +ELLIPSIS
     Traceback (most recent call last):
     ...
-    wallmirror.errors.InputError: memory: F of too many pixels needs 1e+09 GB of memory and ... GB are left; ...
+    wallmirror.errors.InputError: memory: F of too many pixels needs 1 EB of memory and ... are left; ...
     """
     limit = memory_limit()
     if needed > limit:
         raise InputError(
-            f"{what} needs {needed / 1e9:.3g} GB of memory and {limit / 1e9:.3g} GB are left; take fewer of them, or raise "
+            f"{what} needs {size_text(needed)} of memory and {size_text(limit)} are left; take fewer of them, or raise "
             f"{LIMIT_VARIABLE} if the memory is there",
             field="memory",
         )

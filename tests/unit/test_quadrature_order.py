@@ -11,10 +11,10 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from wallmirror import transport
 from wallmirror.brdf import Diffuse, GaussianTrain
 from wallmirror.geometry import Card, Observer, pixel_half_width
-from wallmirror.transport import _Nodes, build_kernel
+from wallmirror.transport import Kernel, build_kernel
+from wallmirror.transport.nodes import Nodes
 
 from .helpers import same_examples
 
@@ -33,7 +33,7 @@ def strip_error(order: int, width: float, distance: float) -> float:
     height = 0.3
     card = Card(elements_x=(0.0,), y=-distance, element_width=width, element_height=height)
     # Along a pixel of no width only the strip is integrated.
-    measured = _Nodes(AHEAD, card, "physical", 0.0, width / 2).kernel((1, order)).apply(WHITE)[0, 0, 0]
+    measured = Kernel(*Nodes(AHEAD, card, "physical", 0.0, width / 2).all_at_once((1, order))).apply(WHITE)[0, 0, 0]
     p, q = width / 2 / distance, height / 2 / distance
     exact = (2 / math.pi) * (
         p / math.hypot(1, p) * math.atan(q / math.hypot(1, p)) + q / math.hypot(1, q) * math.atan(p / math.hypot(1, q))
@@ -44,7 +44,7 @@ def strip_error(order: int, width: float, distance: float) -> float:
 def footprint_error(order: int, half: float, distance: float) -> float:
     """Relative error of the mean of cos^4 / z^2, a point above the middle of a pixel, over the pixel's width."""
     card = Card(elements_x=(0.0,), y=-distance)
-    measured = _Nodes(AHEAD, card, "physical", half, 0.0).kernel((order, 1)).apply(WHITE)[0, 0, 0]
+    measured = Kernel(*Nodes(AHEAD, card, "physical", half, 0.0).all_at_once((order, 1))).apply(WHITE)[0, 0, 0]
     w = 5.0 * half / distance
     exact = (w / (1 + w * w) + math.atan(w)) / (2 * math.pi * w) / distance**2
     return abs(float(measured) / exact - 1)
@@ -94,7 +94,7 @@ def test_the_error_falls_geometrically_at_the_rate_of_the_nearest_pole(name: str
 def test_a_midpoint_rule_of_as_many_nodes_is_of_order_two(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The planted twin: put in place of the Gauss-Legendre rule, it is found out by the claim above."""
     error, half = DIRECTIONS[name]
-    monkeypatch.setattr(transport, "gauss_legendre", midpoint)
+    monkeypatch.setattr("wallmirror.transport.nodes.gauss_legendre", midpoint)
     orders = np.array([8, 16, 32, 64])
     errors = np.array([error(int(n)) for n in orders])
     # Halving the step divides the error by 4; the next term, h^4, is below 2 % of it from 8 nodes on.
@@ -230,10 +230,10 @@ def test_a_tolerance_asked_of_a_midpoint_rule_is_not_kept(monkeypatch: pytest.Mo
     nodes = kernel.weight.shape[-1]
     brightest = float(kernel.weight.sum(axis=-1).max())
     assert abs(float(kernel.apply(brdf)[0, 5, 0]) - exact) <= 2e-6 * brightest
-    monkeypatch.setattr(transport, "gauss_legendre", midpoint)
+    monkeypatch.setattr("wallmirror.transport.nodes.gauss_legendre", midpoint)
     half = pixel_half_width(observer)
     # As many nodes along the strip as the kernel has in both directions together.
-    even = _Nodes(observer, card, "physical", half, card.element_width / 2).kernel((nodes, nodes))
+    even = Kernel(*Nodes(observer, card, "physical", half, card.element_width / 2).all_at_once((nodes, nodes)))
     assert abs(float(even.apply(brdf)[0, 5, 0]) - exact) > 2e-6 * brightest
-    fewer = _Nodes(observer, card, "physical", half, card.element_width / 2).kernel((4, nodes // 4))
+    fewer = Kernel(*Nodes(observer, card, "physical", half, card.element_width / 2).all_at_once((4, nodes // 4)))
     assert abs(float(fewer.apply(brdf)[0, 5, 0]) - exact) > 10 * 2e-6 * brightest

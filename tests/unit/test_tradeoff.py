@@ -329,7 +329,7 @@ def test_a_point_of_the_scaling_panel_is_measured_or_refused_in_its_own_process(
     assert not answer["failure"]
     assert 10e6 < answer["bytes"] < 40e6
     told = scaling.ask(spec, limit_gb=0.005)
-    assert "needs 0.0245 GB of memory" in told["failure"]
+    assert "needs 24.5 MB of memory" in told["failure"]
     assert told["bytes"] < 5e6
     assert scaling._of_refusal("F", told).met is True
     # Twins: a call that was done, and a process that died.

@@ -603,8 +603,8 @@ def test_blocks_and_the_whole_kernel_give_the_same_transport(weights: Weights, m
     for model in (lobes(sigma_deg=3.0), brdf):
         whole = build_kernel(observer, card, weights=weights, orders=(2, 3)).apply(model)
         for block, row in ((1, 1), (100, 30), (10**6, 256)):  # the second cuts pixels and elements
-            monkeypatch.setattr("wallmirror.transport._BLOCK", block)
-            monkeypatch.setattr("wallmirror.transport._ROW", row)
+            monkeypatch.setattr("wallmirror.transport.nodes._BLOCK", block)
+            monkeypatch.setattr("wallmirror.transport.nodes._ROW", row)
             parts = transport_matrix(observer, card, model, weights=weights, orders=(2, 3))
             # Six products, added in another order.
             np.testing.assert_allclose(parts, whole, rtol=0, atol=8 * EPS * np.abs(whole).max())

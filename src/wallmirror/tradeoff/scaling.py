@@ -315,7 +315,7 @@ def of_ratio(ratio: float, spread: float, nodes: int) -> Statement:
 
 def _of_refusal(what: str, answer: dict[str, Any]) -> Statement:
     """Whether what does not fit was refused with its size, by a process that took next to nothing."""
-    refused = "exit" not in answer and "GB of memory" in answer["failure"] and answer["bytes"] < 100e6
+    refused = "exit" not in answer and " of memory and " in answer["failure"] and answer["bytes"] < 100e6
     if refused:
         return Statement(
             f"Beyond the limit, {what}: refused after {answer['bytes'] / 1e6:.0f} MB: “{answer['failure']}”.", True
