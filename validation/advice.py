@@ -54,7 +54,7 @@ from wallmirror.interreflection import from_card
 from wallmirror.jobs.advising import advise
 from wallmirror.jobs.bouncing import DEEP, RR_DEPTH
 from wallmirror.jobs.capturing import film_as_planned
-from wallmirror.jobs.validating import validate_scene
+from wallmirror.jobs.validating_one import validate_scene
 from wallmirror.pathtracing.building import wall_as_rendered
 from wallmirror.pathtracing.rendering import FILM_ROUNDING, Renderer, spread_seeds
 from wallmirror.report.style import CYCLE, FAINT, INK, clean, new_figure

@@ -31,7 +31,8 @@ from scipy import stats
 from wallmirror import GaussianTrain, load_scene, read_captures, write_captures
 from wallmirror.comparison import SIGNIFICANCE
 from wallmirror.files import write_atomically
-from wallmirror.jobs.validating import SEEDS, SPP, VIEWS, Expectation, expect, judge, render_seeds
+from wallmirror.jobs.expecting import Expectation, expect
+from wallmirror.jobs.validating_one import SEEDS, SPP, VIEWS, judge, render_seeds
 from wallmirror.pathtracing.cameras import Sampler
 from wallmirror.pathtracing.filming import render_captures, render_one_hot
 from wallmirror.pathtracing.rendering import Renderer, spread_seeds

@@ -28,7 +28,7 @@ import wallmirror as wm
 from wallmirror.convolution import angle_convolution, spherical_convolution
 from wallmirror.files import write_atomically
 from wallmirror.geometry import incident_angles, pixel_half_width, pixel_tangents
-from wallmirror.jobs.validating import validate_scene
+from wallmirror.jobs.validating_one import validate_scene
 from wallmirror.quadrature import quadrature_order
 from wallmirror.transport import strip_factor
 

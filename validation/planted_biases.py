@@ -30,20 +30,8 @@ from scipy import stats
 from wallmirror.brdf import BRDF, GaussianTrain
 from wallmirror.comparison import SIGNIFICANCE, Comparison, cross_weights
 from wallmirror.geometry import Card, Observer
-from wallmirror.jobs.validating import (
-    QUICK_SPP,
-    QUICK_VIEWS,
-    SEEDS,
-    SPP,
-    VIEWS,
-    Expectation,
-    Sample,
-    Transport,
-    expect,
-    judge,
-    physical_transport,
-    render_seeds,
-)
+from wallmirror.jobs.expecting import Expectation, Transport, expect, physical_transport
+from wallmirror.jobs.validating_one import QUICK_SPP, QUICK_VIEWS, SEEDS, SPP, VIEWS, Sample, judge, render_seeds
 from wallmirror.scene import Scene, load_scene
 from wallmirror.transport import build_kernel
 

@@ -12,10 +12,12 @@ import pytest
 from wallmirror import Mirror, load_scene, read_captures, scale_free_error, scene_names
 from wallmirror.brdf import GaussianTrain, Table
 from wallmirror.interreflection import from_card, from_room
-from wallmirror.jobs import validating
+from wallmirror.jobs import validating, validating_one
 from wallmirror.jobs.capturing import capture_scene
+from wallmirror.jobs.expecting import expect
 from wallmirror.jobs.solving import solve_directory
-from wallmirror.jobs.validating import expect, validate_scene, validate_scenes
+from wallmirror.jobs.validating import validate_scenes
+from wallmirror.jobs.validating_one import validate_scene
 from wallmirror.pathtracing.rendering import Renderer, spread_seeds
 from wallmirror.transport import radiance, transport_matrix
 
@@ -83,7 +85,7 @@ def test_a_wall_that_is_a_function_of_both_angles_is_judged(mi, monkeypatch):
     measured = replace(scene, wall=replace(scene.wall, brdf=lopsided))
     assert validate_scene(measured, views=2, spp=64, seed=11).passed
     for case, plant in ((scene, plant_rougher), (measured, plant_swapped)):
-        monkeypatch.setattr(validating, "Renderer", lambda s, plant=plant, **options: Renderer(plant(s), **options))
+        monkeypatch.setattr(validating_one, "Renderer", lambda s, plant=plant, **options: Renderer(plant(s), **options))
         assert not validate_scene(case, views=2, spp=64, seed=11).passed
 
 
@@ -113,7 +115,7 @@ def plant_card_moved(scene, factor=1.01):
 def test_planted_faults_are_rejected(mi, monkeypatch, plant):
     """The render has the fault, the analytic side has not."""
     scene = small("flat_wall_lobes")
-    monkeypatch.setattr(validating, "Renderer", lambda s, **options: Renderer(plant(s), **options))
+    monkeypatch.setattr(validating_one, "Renderer", lambda s, **options: Renderer(plant(s), **options))
     if plant is plant_gain:
         real = Renderer.render
         monkeypatch.setattr(Renderer, "render", lambda self, view, v, **o: real(self, view, 1.1 * np.asarray(v), **o))
@@ -124,7 +126,7 @@ def test_mirror_whose_card_moved_is_rejected(mi, monkeypatch):
     scene = small("flat_wall_mirror", pixels=500)
     assert isinstance(scene.wall.brdf, Mirror)
     # 10 % moves the strips' images by more than the pixels left out at their borders.
-    monkeypatch.setattr(validating, "Renderer", lambda s, **options: Renderer(plant_card_moved(s, 1.1), **options))
+    monkeypatch.setattr(validating_one, "Renderer", lambda s, **options: Renderer(plant_card_moved(s, 1.1), **options))
     assert not validate_scene(scene, views=3, spp=64, seed=11).passed
 
 

@@ -38,7 +38,9 @@ def validate(
     as_json: AsJson = False,
 ) -> None:
     """Test the analytic one-bounce model against Mitsuba, scene by scene, and say what bias would have shown."""
-    from wallmirror.jobs.validating import QUICK_SPP, QUICK_VIEWS, SPP, VIEWS, validate_scenes, verdict
+    from wallmirror.jobs.validating import validate_scenes
+    from wallmirror.jobs.validating_one import QUICK_SPP, QUICK_VIEWS, SPP, VIEWS
+    from wallmirror.jobs.validation_report import verdict
     from wallmirror.scene import Scene, load_scene, scene_names
 
     terminal = Terminal(as_json=as_json)

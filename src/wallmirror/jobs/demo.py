@@ -14,8 +14,9 @@ from wallmirror.files import write_atomically
 from wallmirror.jobs.capturing import capture_scene
 from wallmirror.jobs.solving import Solved, solution_sections, solve_directory
 from wallmirror.jobs.solving import verdicts as solution_verdicts
-from wallmirror.jobs.validating import Validation, numbers, validate_scene
-from wallmirror.jobs.validating import verdict as validation_verdict
+from wallmirror.jobs.validating_one import Validation, validate_scene
+from wallmirror.jobs.validation_report import numbers
+from wallmirror.jobs.validation_report import verdict as validation_verdict
 from wallmirror.pathtracing.rendering import picture
 from wallmirror.pathtracing.runtime import Runtime, activate
 from wallmirror.report import FigureBlock, Section, TableBlock, Verdict, write_page

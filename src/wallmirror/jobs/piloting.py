@@ -15,7 +15,8 @@ from wallmirror.comparison import detectable_gain
 from wallmirror.geometry import Card, Observer
 from wallmirror.interreflection import from_card
 from wallmirror.jobs.bouncing import DEEP, RR_DEPTH, spread
-from wallmirror.jobs.validating import SEEDS, Transport, expect, render_seeds
+from wallmirror.jobs.expecting import Transport, expect
+from wallmirror.jobs.validating_one import SEEDS, render_seeds
 from wallmirror.pathtracing.filming import steadied
 from wallmirror.pathtracing.rendering import Renderer, largest_pass, spread_seeds
 from wallmirror.planning.sampling import MOST_SPP, NoiseLevel, Sampler, Sampling
