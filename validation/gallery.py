@@ -32,7 +32,7 @@ from wallmirror.picture_reading import load_picture
 from wallmirror.picture_scene import PictureScene
 from wallmirror.thesis import Claim
 from wallmirror.thesis.picture_claims import judge
-from wallmirror.thesis.studies import SPARK, Effort, percent, study, white_of, without_sparks
+from wallmirror.thesis.studies import SPARK, Effort, study, white_of, without_sparks
 
 SCENES = (
     "thesis_spheres",
@@ -117,7 +117,7 @@ def section(scene: PictureScene, found: dict[str, RegionBounces], claims: tuple[
     for region, bounces in found.items():
         series = bounces.series
         terms = ["dark", "–", "–"] if series is None else [f"{t.value:.3f}" for t in series.terms[:3]]
-        rows.append([region, percent(bounces.missing), *terms])
+        rows.append([region, bounces.missing.percent, *terms])
     numbers = table(["region", "missing with one bounce", "k = 2", "k = 3", "k = 4"], rows)
     if found[WHOLE].exact:
         numbers = "Missing with one bounce: 0, exactly."
@@ -177,7 +177,7 @@ def measured_before() -> dict[str, str]:
     if not BOUNCES.exists():
         return {}
     return {
-        b["scene"]: "0, exactly" if b["exact"] else percent(Measured(**b["beyond"]))
+        b["scene"]: "0, exactly" if b["exact"] else Measured(**b["beyond"]).percent
         for b in json.loads(BOUNCES.read_text())["bounces"]
     }
 
@@ -196,7 +196,7 @@ def main() -> int:
         studies[name] = found, claims
         write_atomically(out / "gallery" / f"{name}.png", image)
         verdicts = ", ".join(claim.outcome for claim in claims)
-        print(f"{name:<32} missing {percent(found[WHOLE].missing)}; {verdicts}", flush=True)
+        print(f"{name:<32} missing {found[WHOLE].missing.percent}; {verdicts}", flush=True)
     walls = []
     exact = True
     known = measured_before()
@@ -209,7 +209,7 @@ def main() -> int:
         else:
             bounces = measure_bounces(scene, seeds=settings["seeds"])
             exact = exact and bounces.exact == scene.is_one_bounce
-            share = "0, exactly" if bounces.exact else percent(bounces.beyond)
+            share = "0, exactly" if bounces.exact else bounces.beyond.percent
         walls.append((scene.name, scene.title, share))
         print(f"{scene.name:<32} {share}", flush=True)
     document = {

@@ -63,6 +63,17 @@ class Measured:
     low: float
     high: float
 
+    @property
+    def percent(self) -> str:
+        """A share in per cent with its standard error, as many digits as the error bears."""
+        if math.isnan(self.value):
+            return "–"
+        error = 100 * self.error
+        if error <= 0:
+            return f"{100 * self.value:.3g} %, exactly"
+        digits = max(0, min(6, 1 - math.floor(math.log10(error))))
+        return f"{100 * self.value:.{digits}f} ± {error:.{digits}f} %"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Bounces:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from wallmirror.console import Advance
 from wallmirror.files import write_atomically
-from wallmirror.jobs.bouncing import DEEP, TOLERANCES, Bounces, Measured, measure_bounces, summary
+from wallmirror.jobs.bouncing import DEEP, TOLERANCES, Bounces, measure_bounces, summary
 from wallmirror.pathtracing.rendering import picture
 from wallmirror.report import FigureBlock, Section, TableBlock, Verdict, write_page
 from wallmirror.report.figures import one_tone, scene_plan
@@ -69,7 +69,7 @@ class BounceVerdict:
             return f"{name}: one bounce is all there is, to the bit"
         asked = TOLERANCES if self.tolerance is None else (self.tolerance,)
         found = "; ".join(f"within {100 * t:g} % it {_SAID[self.bounces.verdict(t)]}" for t in asked)
-        return f"{name}: one bounce leaves out {percent(self.bounces.beyond)}; {found}"
+        return f"{name}: one bounce leaves out {self.bounces.beyond.percent}; {found}"
 
     def summary(self) -> dict[str, Any]:
         """The scene's part of bounces.json."""
@@ -133,17 +133,6 @@ def _colour(result: BounceVerdict) -> bool | None:
     return True if result.bounces.exact else None if result.tolerance is None else result.passed
 
 
-def percent(measured: Measured) -> str:
-    """A share with its standard error, as many digits as the error bears."""
-    if math.isnan(measured.value):
-        return "–"
-    error = 100 * measured.error
-    if error <= 0:
-        return f"{100 * measured.value:.3g} %"
-    digits = max(0, min(6, 1 - math.floor(math.log10(error))))
-    return f"{100 * measured.value:.{digits}f} ± {error:.{digits}f} %"
-
-
 def section(result: BounceVerdict) -> Section:
     """The report's section on one scene: prose, plan, pictures, series."""
     scene = result.scene
@@ -168,14 +157,14 @@ def section(result: BounceVerdict) -> Section:
 
 def series(bounces: Bounces) -> TableBlock:
     """The terms of the Neumann series in a table."""
-    rows = [(f"after {k} reflections", percent(term), "") for k, term in enumerate(bounces.terms, start=2)]
+    rows = [(f"after {k} reflections", term.percent, "") for k, term in enumerate(bounces.terms, start=2)]
     for k, ratio in enumerate(bounces.ratios, start=1):
         if k + 2 <= len(bounces.terms) + 1:
             old = rows[k + 2 - 2]
-            rows[k + 2 - 2] = (old[0], old[1], percent(ratio))
+            rows[k + 2 - 2] = (old[0], old[1], ratio.percent)
     bound = "no bound" if math.isinf(bounces.tail_bound) else f"at most {100 * bounces.tail_bound:.2g} %"
-    rows.append((f"all further, to depth {DEEP}", percent(bounces.rest), f"{bound} by the ratios"))
-    rows.append(("all beyond one bounce", percent(bounces.beyond), ""))
+    rows.append((f"all further, to depth {DEEP}", bounces.rest.percent, f"{bound} by the ratios"))
+    rows.append(("all beyond one bounce", bounces.beyond.percent, ""))
     return TableBlock(
         ("light that reached the camera", "share of the one-bounce light", "ratio to two reflections before"),
         tuple(rows),

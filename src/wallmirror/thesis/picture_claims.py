@@ -8,7 +8,7 @@ from wallmirror.jobs.bouncing import DEEP, Measured
 from wallmirror.jobs.picturing import WHOLE, RegionBounces
 from wallmirror.pathtracing.picturing import PictureRenderer
 from wallmirror.thesis.figure import Claim, Outcome
-from wallmirror.thesis.studies import Effort, PictureStudy, angle_sums, difference_of_shape, measure, percent
+from wallmirror.thesis.studies import Effort, PictureStudy, angle_sums, difference_of_shape, measure
 
 
 def judge(studied: PictureStudy, effort: Effort) -> tuple[Claim, ...]:
@@ -54,19 +54,19 @@ def _of_the_field(found: dict[str, RegionBounces]) -> tuple[Claim, ...]:
             else "refuted"
             if glass.high < max(other.low for other in others)
             else "undecided",
-            measured=f"The glass sphere lacks {percent(glass)} of its light, the metal sphere {percent(metal)}.",
+            measured=f"The glass sphere lacks {glass.percent} of its light, the metal sphere {metal.percent}.",
         ),
         Claim(
             thesis="Mirrors tell sky from geometry, but lose the geometry's colour.",
             outcome="confirmed" if below.low > metal.high else "refuted" if below.high < metal.low else "undecided",
-            measured=f"The lower half of the metal sphere, where it shows the ground, lacks {percent(below)}: "
+            measured=f"The lower half of the metal sphere, where it shows the ground, lacks {below.percent}: "
             "not a colour but black.",
         ),
         Claim(
             thesis="Diffuse materials are rendered fine, except for the lower part of spheres.",
             outcome=fine,
-            measured=f"The lower half of the diffuse sphere lacks {percent(lower)}, but the upper half "
-            f"{percent(upper)} as well; the ground {percent(ground)}.",
+            measured=f"The lower half of the diffuse sphere lacks {lower.percent}, but the upper half "
+            f"{upper.percent} as well; the ground {ground.percent}.",
         ),
     )
 
@@ -88,15 +88,15 @@ def _of_the_box(
         Claim(
             thesis="The back wall with one bounce is really similar to the one with fifty.",
             outcome=similar,
-            measured=f"It lacks {percent(wall)} of its light. After the best common factor, blocks of 8 x 8 "
+            measured=f"It lacks {wall.percent} of its light. After the best common factor, blocks of 8 x 8 "
             f"pixels still differ by {100 * shape:.1f} % in shape and colour: an eye that adapts sees little of it, a "
             "measurement all of it.",
         ),
         Claim(
             thesis="For a source before a diffuse wall, the first two terms are very close.",
             outcome=close,
-            measured=f"With the background dark the wall lacks {percent(spot)} if the camera looks through the "
-            f"source at the spot that it lights, and {percent(source)} if the source covers that spot, as it does in "
+            measured=f"With the background dark the wall lacks {spot.percent} if the camera looks through the "
+            f"source at the spot that it lights, and {source.percent} if the source covers that spot, as it does in "
             "the thesis.",
         ),
     )
@@ -109,13 +109,13 @@ def _of_the_mirror(found: dict[str, RegionBounces]) -> tuple[Claim, ...]:
             thesis="The entirety of the source is reflected with one bounce.",
             outcome="confirmed" if source.exact else "refuted",
             measured="The sources' image in the mirror is the same at one bounce and at "
-            f"{DEEP - 1}{', to the bit' if source.exact else f' but for {percent(source.missing)}'}.",
+            f"{DEEP - 1}{', to the bit' if source.exact else f' but for {source.missing.percent}'}.",
         ),
         Claim(
             thesis="Nothing else than what shines is reflected properly.",
             outcome="confirmed" if floor.low > 0.5 else "refuted" if floor.high < 0.5 else "undecided",
-            measured=f"The floor in the mirror lacks {percent(floor)}; the whole back wall "
-            f"{percent(found['back wall'].missing)}, and the diffuse floor itself {percent(found['floor'].missing)}.",
+            measured=f"The floor in the mirror lacks {floor.percent}; the whole back wall "
+            f"{found['back wall'].missing.percent}, and the diffuse floor itself {found['floor'].missing.percent}.",
         ),
     )
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from wallmirror.jobs.bouncing import DEEP, Measured
+from wallmirror.jobs.bouncing import DEEP
 from wallmirror.jobs.picturing import RegionBounces, measure_picture_bounces
 from wallmirror.pathtracing.picturing import PictureRenderer
 from wallmirror.picture_scene import PictureScene
@@ -138,12 +138,3 @@ def angle_sums(scene: PictureScene, image: Array) -> list[float]:
         for part in (slice(0, cut), slice(cut, None)):
             found.append(float(np.average(u[side][part], weights=light[side][part])))
     return found
-
-
-def percent(measured: Measured) -> str:
-    """A share in per cent with its standard error."""
-    error = 100 * measured.error
-    if error <= 0:
-        return f"{100 * measured.value:.3g} %, exactly"
-    digits = max(0, min(6, 1 - math.floor(math.log10(error))))
-    return f"{100 * measured.value:.{digits}f} ± {error:.{digits}f} %"
