@@ -19,8 +19,10 @@ LIMIT_VARIABLE = "WALLMIRROR_MEMORY_GB"
 _FLOAT = 8
 # Arrays of the kernel's size that live while it is built or applied: three stored, the rest temporary.
 _KERNEL_ARRAYS = 8
-# F at two quadrature orders, and beside it a block of nodes with its temporary arrays.
-_TRANSPORT_ARRAYS, _BLOCK_BYTES = 2, 4e6
+# Beside F a block of nodes with its temporary arrays.
+_BLOCK_BYTES = 4e6
+# A picture's own float64, the film with its channels in float32, and a block of paths.
+_PICTURE_ARRAYS, _PATH_BYTES = 7, 64e6
 # The films, normalised, weighted, and in their QR factorisation.
 _FILM_ARRAYS = 6
 # Beside degree + 1 basis functions at all nodes: their sums and places, and one element's share with the weight.
@@ -85,9 +87,9 @@ def kernel_bytes(views: int, pixels: int, elements: int, nodes: int) -> float:
     return float(_FLOAT * _KERNEL_ARRAYS) * views * pixels * elements * nodes
 
 
-def transport_bytes(views: int, pixels: int, elements: int) -> float:
-    """Peak of `transport_matrix`, which goes through the nodes block by block."""
-    return float(_FLOAT * _TRANSPORT_ARRAYS) * views * pixels * elements + _BLOCK_BYTES
+def transport_bytes(views: int, pixels: int, elements: int, *, compared: bool = True) -> float:
+    """Peak of `transport_matrix`, which goes through the nodes block by block; F at two orders where they are `compared`."""
+    return float(_FLOAT * (2 if compared else 1)) * views * pixels * elements + _BLOCK_BYTES
 
 
 def design_bytes(views: int, pixels: int, elements: int, nodes: int, *, degree: int, knots: int) -> float:
@@ -95,6 +97,11 @@ def design_bytes(views: int, pixels: int, elements: int, nodes: int, *, degree: 
     return float(_FLOAT) * (
         views * pixels * float(elements) * nodes * (degree + _NODE_ARRAYS) + float(_KNOT_SQUARES) * knots**2
     )
+
+
+def picture_bytes(width: int, height: int) -> float:
+    """Peak of rendering a picture, which goes through the paths block by block."""
+    return float(_FLOAT * _PICTURE_ARRAYS) * width * height + _PATH_BYTES
 
 
 def film_bytes(views: int, pixels: int, realisations: int) -> float:

@@ -68,6 +68,12 @@ def test_a_transport_matrix_takes_what_is_foretold_whatever_its_quadrature() -> 
         assert used <= foretold <= ROOM * used
 
 
+def test_a_transport_matrix_of_known_orders_takes_half_of_that() -> None:
+    foretold = memory.transport_bytes(10, 2000, 16, compared=False)
+    used = peak(lambda: transport_matrix(WIDE, thesis_card(elements=16, width=0.02), LOBES, orders=(2, 4)))
+    assert used <= foretold <= ROOM * used
+
+
 def test_one_wide_view_takes_no_more_than_its_share() -> None:
     # Whatever is looked for before F, such as the widest turn in one pixel, goes through the pixels in blocks as well.
     observer, card = thesis_observer(40_000, 1, "centres"), thesis_card(elements=16, width=0.02)

@@ -38,6 +38,9 @@ def tradeoff(
     ] = None,
     out: Out = Path("out/tradeoff"),
     quick: Annotated[bool, typer.Option("--quick", help="Fewer and smaller runs, within a minute.")] = False,
+    full: Annotated[
+        bool, typer.Option("--full", help="Scaling: on to the largest sizes that 16 GB hold, half an hour.")
+    ] = False,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -46,7 +49,7 @@ def tradeoff(
 
     terminal = Terminal(as_json=as_json)
     with terminal.progress("measuring, per cent") as advance:
-        traded = measure_tradeoffs(panels or (), out, quick=quick, seed=seed, progress=advance)
+        traded = measure_tradeoffs(panels or (), out, quick=quick, full=full, seed=seed, progress=advance)
     for panel in traded.panels:
         terminal.say(panel.title, style="bold")
         for statement in panel.conclusions:

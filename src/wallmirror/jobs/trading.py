@@ -65,7 +65,13 @@ class Traded:
 
 
 def measure_tradeoffs(
-    names: Sequence[str], out: Path, *, quick: bool = False, seed: int = 0, progress: Advance | None = None
+    names: Sequence[str],
+    out: Path,
+    *,
+    quick: bool = False,
+    full: bool = False,
+    seed: int = 0,
+    progress: Advance | None = None,
 ) -> Traded:
     """Measure the named panels, or all; leaves one CSV a panel, results.json and tradeoff.html in a folder.
 
@@ -75,13 +81,17 @@ def measure_tradeoffs(
         Of `PANELS`; empty for all.
     quick:
         Fewer settings and smaller scenes: less than a minute in all on two idle cores.
+    full:
+        The panel of sizes goes on until 16 GB are full, which takes half an hour.
 
     Raises
     ------
     InputError
-        For an unknown panel, before anything is measured.
+        For an unknown panel, or `full` without the panel of sizes, before anything is measured.
     """
     chosen = tuple(dict.fromkeys(names)) or tuple(PANELS)
+    if full and (quick or "scaling" not in chosen):
+        raise InputError("has a meaning for the panel scaling alone, and without --quick; leave it out", field="full")
     for name in chosen:
         if name not in PANELS:
             raise InputError(f'is "{name}"; choose among {", ".join(PANELS)}', field="panel")
@@ -97,7 +107,8 @@ def measure_tradeoffs(
                 if progress is not None:
                     progress(round(100 * (number + done / total)), 100 * len(chosen))
 
-            panel = PANELS[name](quick=quick, seed=seed, progress=advance)
+            more = {"full": True} if full and name == "scaling" else {}
+            panel = PANELS[name](quick=quick, seed=seed, progress=advance, **more)
             reference.append(reference_seconds())
             write_atomically(out / f"{name}.csv", to_csv(panel.runs))
             panels.append(panel)

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wallmirror.errors import InputError
+from wallmirror.memory import picture_bytes, require_memory
 from wallmirror.pathtracing import building, cameras
 from wallmirror.pathtracing.cameras import Sampler
 from wallmirror.pathtracing.runtime import activate
@@ -268,7 +269,14 @@ def picture(
     seed: int = 0,
     variant: str = "llvm_ad_mono",
 ) -> Array:
-    """Radiance that a visitor beside the observer would see, wall, card and room, shape (height, width)."""
+    """Radiance that a visitor beside the observer would see, wall, card and room, shape (height, width).
+
+    Raises
+    ------
+    InputError
+        If the picture is larger than the memory.
+    """
+    require_memory(picture_bytes(width, height), f"a picture of {width} x {height} pixels")
     activate(variant)
     mi: Any = importlib.import_module("mitsuba")
     world = building.mitsuba_dict(scene, None, radiances=scene.source[:, realisation])

@@ -13,9 +13,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from wallmirror.report.style import FAINT, INK, OURS, PALE, WARM, clean, new_figure
 from wallmirror.tradeoff.budget import DRAWN, FORETOLD, RENDERED
+from wallmirror.tradeoff.growth import TRACER
 from wallmirror.tradeoff.pareto import fit_line, pareto_front, short_seconds
 from wallmirror.tradeoff.runs import Panel, Run, by_method
-from wallmirror.tradeoff.scaling import TRACER
 
 #: Colours and marks of up to sixteen lines, told apart without colour as well.
 _LOOKS = tuple(

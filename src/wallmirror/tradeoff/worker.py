@@ -1,9 +1,10 @@
 """One point of the scaling panel in a process of its own, so that its peak memory is its own.
 
-    python -m wallmirror.tradeoff.worker '{"kind": "transport", "pixels": 500, "views": 20, "elements": 4}'
+    python -m wallmirror.tradeoff.worker '{"kind": "transport", "pixels": 500, "views": 20, "elements": 4}' [BYTES]
 
-Prints one line of JSON: processor seconds, bytes taken beyond what stood before, and the refusal if there was one. The peak
-is VmHWM where Linux tells it: getrusage's ru_maxrss is inherited from the process that started this one.
+Beyond so many bytes the system refuses the process its memory. Prints one line of JSON: processor seconds, bytes taken
+beyond what stood before, and the refusal if there was one. The peak is VmHWM where Linux tells it:
+getrusage's ru_maxrss is inherited from the process that started this one.
 """
 
 from __future__ import annotations
@@ -95,6 +96,8 @@ def measure(spec: Mapping[str, Any]) -> dict[str, Any]:
         work()
     except WallmirrorError as refusal:
         failure = str(refusal)
+    except MemoryError as end:
+        failure = f"MemoryError: {end}"
     seconds, wall = time.process_time() - a, time.perf_counter() - b
     return {"seconds": seconds, "wall": wall, "bytes": max(0.0, _resident("VmHWM") - before), "failure": failure}
 
@@ -113,5 +116,17 @@ def _resident(name: str) -> float:
     return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
+def _limit(most: int) -> None:
+    """Let allocations beyond so many bytes fail, where the system can."""
+    try:
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    except (ImportError, AttributeError, ValueError, OSError):
+        sys.stderr.write("no limit on memory on this system\n")
+
+
 if __name__ == "__main__":
+    if len(sys.argv) > 2:
+        _limit(int(sys.argv[2]))
     sys.stdout.write(json.dumps(measure(json.loads(sys.argv[1]))) + "\n")

@@ -47,7 +47,7 @@ def transport_matrix(
     (20, 500, 4)
     """
     require_memory(
-        transport_bytes(observer.views, observer.pixels, card.elements),
+        transport_bytes(observer.views, observer.pixels, card.elements, compared=orders is None),
         f"F of {observer.views} views x {observer.pixels} pixels x {card.elements} elements",
     )
     if isinstance(brdf, Mirror):
