@@ -20,7 +20,19 @@ from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.jobs import trading
 from wallmirror.report.tradeoffs import panel_figures
 from wallmirror.scene import load_scene
-from wallmirror.tradeoff import budget, forward, growth, inverse, scaling, transcendental
+from wallmirror.tradeoff import (
+    budget_words,
+    forward,
+    forward_analytic,
+    forward_task,
+    forward_words,
+    growth,
+    inverse,
+    scaling,
+    split_runs,
+    splits,
+    transcendental,
+)
 from wallmirror.tradeoff.pareto import (
     falls,
     fit_line,
@@ -56,7 +68,9 @@ def monte_carlo(
     method: str = "m",
 ) -> list[Run]:
     """Runs that obey error = at_one n^slope and seconds = start + price n exactly."""
-    return [a_run(start + price * n, at_one * n**slope, method=method, group=forward.IMAGE, work=n) for n in counts]
+    return [
+        a_run(start + price * n, at_one * n**slope, method=method, group=forward_task.IMAGE, work=n) for n in counts
+    ]
 
 
 # -- front and lines ----------------------------------------------------------------------------------------------
@@ -168,7 +182,7 @@ def test_seconds_are_told_in_a_unit_that_fits(seconds: float, text: str) -> None
 
 def image_runs(best: float, independent: float) -> list[Run]:
     """The analytic model takes 1 ms to 1e-3; the samplers `best` and `independent` times as long, on their lines."""
-    ours = [a_run(1e-3, 9e-4, method=forward.PHYSICAL, group=forward.IMAGE)]
+    ours = [a_run(1e-3, 9e-4, method=forward_analytic.PHYSICAL, group=forward_task.IMAGE)]
     counts = [16.0, 64.0, 256.0, 1024.0]
     # error = n^-1/2: 1e-3 at a million samples.
     lines = {"Mitsuba, orthogonal": best, "Mitsuba, independent": independent}
@@ -183,7 +197,7 @@ def image_runs(best: float, independent: float) -> list[Run]:
     ("best", "independent", "met"), [(150, 6000, True), (90, 6000, False), (150, 4000, False), (90, 4000, False)]
 )
 def test_the_analytic_model_is_as_much_faster_as_asked_or_it_is_not(best: float, independent: float, met: bool) -> None:
-    statements = forward.conclude(image_runs(best, independent), floor=1e-6)
+    statements = forward_words.conclude(image_runs(best, independent), floor=1e-6)
     (asked,) = [s for s in statements if s.met is not None and "0.001" in s.text]
     assert asked.met is met
     assert f"{best:g} times faster than Mitsuba's best sampler here, orthogonal" in asked.text
@@ -192,8 +206,10 @@ def test_the_analytic_model_is_as_much_faster_as_asked_or_it_is_not(best: float,
 
 
 def test_a_model_that_never_comes_there_fails() -> None:
-    runs = [replace(run, error=0.5) if run.method == forward.PHYSICAL else run for run in image_runs(150, 6000)]
-    assert all(s.met is False for s in forward.conclude(runs, floor=1e-6))
+    runs = [
+        replace(run, error=0.5) if run.method == forward_analytic.PHYSICAL else run for run in image_runs(150, 6000)
+    ]
+    assert all(s.met is False for s in forward_words.conclude(runs, floor=1e-6))
 
 
 def growing(exponent: float, sweep: growth.Sweep) -> growth.Law:
@@ -216,7 +232,7 @@ def test_three_times_the_transcendental_functions_is_the_limit() -> None:
 
 
 def split_run(a: int, b: int, error: float, *, foretold: float | None = None, draw: int = 0) -> Run:
-    method = budget.FORETOLD if foretold is None else budget.DRAWN
+    method = split_runs.FORETOLD if foretold is None else split_runs.DRAWN
     knobs = {"views": a, "realisations": b, "each": 1.0} | ({} if foretold is None else {"draw": draw})
     extra = {} if foretold is None else {"foretold": foretold}
     return Run(group="g", method=method, knobs=knobs, seconds=1.0, error=error, extra=extra)
@@ -226,35 +242,37 @@ def split_run(a: int, b: int, error: float, *, foretold: float | None = None, dr
 def test_a_forecast_is_confirmed_by_what_is_measured_or_not(ratio: float, met: bool) -> None:
     found = [split_run(5, 4, 0.01), split_run(20, 20, 0.02), split_run(2, 40, 0.04)]
     measured = [split_run(5, 4, 0.01 * ratio, foretold=0.01, draw=d) for d in range(4)]
-    first, second = budget.conclude("g", found, measured)
+    first, second = budget_words.conclude("g", found, measured)
     assert "best is A 5 B 4, 1 % off" in first.text
     assert "the thesis's split, A 20 and B 20, 2.00 times that" in first.text
     assert "worst is A 2 B 40, 4 times" in first.text
     assert second.met is met
     assert f"A 5 B 4 {ratio:.2f}" in second.text
     # Fewer draws than four are no verdict.
-    assert budget.conclude("g", found, measured[:3])[1].met is None
+    assert budget_words.conclude("g", found, measured[:3])[1].met is None
 
 
 def test_a_refusal_of_the_solver_is_told() -> None:
-    failed = Run(group="g", method=budget.DRAWN, knobs={"views": 5, "realisations": 4}, seconds=1.0, failure="too dark")
-    statement = budget.conclude("g", [split_run(5, 4, 0.01)], [failed])[-1]
+    failed = Run(
+        group="g", method=split_runs.DRAWN, knobs={"views": 5, "realisations": 4}, seconds=1.0, failure="too dark"
+    )
+    statement = budget_words.conclude("g", [split_run(5, 4, 0.01)], [failed])[-1]
     assert "refuses A 5 B 4" in statement.text
     assert "too dark" in statement.text
 
 
 def test_what_a_render_may_take_is_what_its_seconds_pay_for() -> None:
-    costs = budget.Costs(start=0.01, sample=1e-4, scatter=1.0, doubt=0.1)
+    costs = splits.Costs(start=0.01, sample=1e-4, scatter=1.0, doubt=0.1)
 
     def price(samples: int) -> float:
-        return math.ceil(samples / budget.PASS) * costs.start + samples * costs.sample
+        return math.ceil(samples / splits.PASS) * costs.start + samples * costs.sample
 
     for seconds in (0.0101, 0.05, 0.1124, 0.13, 1.0):
-        samples = budget.affordable(seconds, costs)
+        samples = splits.affordable(seconds, costs)
         # One more sample, or one more pass of one sample, would cost too much.
         assert price(samples) <= seconds * (1 + 1e-12)
         assert price(samples + 1) > seconds * (1 - 1e-12)
-    assert budget.affordable(0.0099, costs) == 0
+    assert splits.affordable(0.0099, costs) == 0
 
 
 def solver_run(method: str, seconds: float, ratio: float) -> Run:
@@ -352,7 +370,7 @@ def test_a_panel_becomes_a_page_with_all_runs_and_its_answer(tmp_path: Path, mon
     (panel,) = traded.panels
     lines = by_method(panel.runs)
     # More nodes, less error, down to what 4 x 8 nodes reach at a strip of 1.1 lobe widths.
-    errors = [run.error for run in lines[forward.PHYSICAL]]
+    errors = [run.error for run in lines[forward_analytic.PHYSICAL]]
     assert errors[0] > 1e-2
     assert errors[-1] < 1e-7
     assert lines["Algorithm 1, float64"][0].error < 1e-13

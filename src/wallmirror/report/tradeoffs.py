@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from wallmirror.report.style import FAINT, INK, OURS, PALE, WARM, clean, new_figure
-from wallmirror.tradeoff.budget import DRAWN, FORETOLD, RENDERED
 from wallmirror.tradeoff.growth import TRACER
 from wallmirror.tradeoff.pareto import fit_line, pareto_front, short_seconds
 from wallmirror.tradeoff.runs import Panel, Run, by_method
+from wallmirror.tradeoff.split_runs import DRAWN, FORETOLD, RENDERED
 
 #: Colours and marks of up to sixteen lines, told apart without colour as well.
 _LOOKS = tuple(

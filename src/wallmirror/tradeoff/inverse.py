@@ -30,6 +30,7 @@ from wallmirror.tradeoff.runs import Omission, Panel, Run, Statement, by_method
 from wallmirror.transport import Weights, radiance, transport_matrix
 
 Array = NDArray[np.float64]
+
 Advance = Callable[[int, int], None]
 
 #: Noise in decibels below the captures' root mean square.
