@@ -60,20 +60,14 @@ def trusted_bound(
     UndeterminedError
         If a pattern is likely noise, or nothing is determined without one that may be.
     """
-    (elements, realisations), rows = source.shape, transport.shape[0]
+    elements = source.shape[0]
     triangle = np.linalg.qr(problem.row_weights * transport, mode="r")
     left, strength, right = np.linalg.svd(triangle @ source, full_matrices=False)
-    free = free_coefficients(problem, level, source, sigma)
-
-    def standing_out(units: float) -> int:
-        edges = [noise_edge(min(elements + free, rows) - k, realisations - k, units) for k in range(elements)]
-        below = np.flatnonzero(strength <= sigma * np.array(edges))
-        return int(below[0]) if below.size else elements
-
-    certain = standing_out(CERTAIN)
+    size = (transport.shape[0], source.shape[1], free_coefficients(problem, level, source, sigma))
+    certain = standing_out(strength / sigma, *size)
     if certain == elements:
         return bound
-    likely = standing_out(LIKELY)
+    likely = standing_out(strength / sigma, *size, units=LIKELY)
     if likely < elements:
         raise too_few_patterns(likely, elements)
     kept = np.linalg.lstsq(triangle, (left[:, :certain] * strength[:certain]) @ right[:certain], rcond=None)[0]
@@ -81,6 +75,24 @@ def trusted_bound(
     if not math.isfinite(wide.source_error):
         raise too_few_patterns(certain, elements)
     return wide
+
+
+def standing_out(strength: Array, rows: int, realisations: int, free: int, units: float = CERTAIN) -> int:
+    """How many patterns, from the strongest on, noise of unit variance would not have made beside those before them.
+
+    Parameters
+    ----------
+    strength:
+        Singular values of F V, falling, shape (M,).
+    rows, realisations:
+        P and B.
+    free:
+        Coefficients that follow a false pattern, see `free_coefficients`.
+    """
+    elements = strength.size
+    edges = [noise_edge(min(elements + free, rows) - k, realisations - k, units) for k in range(elements)]
+    below = np.flatnonzero(strength <= np.array(edges))
+    return int(below[0]) if below.size else elements
 
 
 def free_coefficients(problem: Problem, level: Level, source: Array, sigma: float) -> int:
