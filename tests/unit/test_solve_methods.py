@@ -17,11 +17,9 @@ from wallmirror.brdf import AngleSumBRDF, AngleSumTable, Diffuse, GaussianTrain,
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.components import components
 from wallmirror.derendering.estimate import scale_free_error
-from wallmirror.derendering.noisy import require_patterns
-from wallmirror.derendering.problem import Problem, prepare
+from wallmirror.derendering.problem import prepare
 from wallmirror.derendering.solution import Solution
 from wallmirror.derendering.solve import Method, solve
-from wallmirror.derendering.subspace import noise_edge
 from wallmirror.geometry import Card, Observer
 from wallmirror.transport import Weights, radiance, transport_matrix
 
@@ -494,51 +492,6 @@ def test_the_same_with_a_dark_element_is_refused_with_the_number_of_patterns() -
     message = assert_undetermined(lambda: solve(captures))
     assert "only 5 independent pattern(s)" in message
     assert "6 elements" in message
-
-
-def synthetic(strengths: Array, *, rows: int = 60, realisations: int = 9, weight: float = 1.0) -> tuple[Problem, ...]:
-    """F and V of which F V has the singular values given, with rows weighted alike."""
-    rng = np.random.default_rng(0)
-    elements = strengths.size
-    left = np.linalg.qr(rng.standard_normal((rows, elements)))[0]
-    right = np.linalg.qr(rng.standard_normal((realisations, elements)))[0]
-    mixing = rng.standard_normal((elements, elements)) + 3 * np.eye(elements)
-    transport, source = (left * strengths) @ mixing, np.linalg.solve(mixing, right.T)
-    observer, card = thesis_observer(rows, 1), thesis_card(elements)
-    captures = CaptureSet(observer=observer, card=card, radiance=np.zeros((1, rows, realisations)))
-    shape = (rows, realisations)
-    weights = np.full(shape, weight)
-    problem = Problem(captures, np.zeros(shape), weights, np.ones(shape, dtype=bool), True, 1.0)
-    return problem, transport, source  # type: ignore[return-value]
-
-
-def test_a_fit_needs_every_pattern_above_the_noise_of_a_matrix_of_2m_rows() -> None:
-    elements, realisations, sigma = 4, 9, 0.3
-    edge = noise_edge(2 * elements, realisations)
-    just = np.array([50.0, 20.0, 3.0, 1.02]) * sigma * edge
-    require_patterns(*synthetic(just), sigma)  # type: ignore[arg-type]
-    # The planted faults: one pattern, then two, below the edge by as little.
-    for low, found in (((1, 1, 1, 0.98), 3), ((1, 1, 0.9, 0.5), 2), ((0.1, 0.1, 0.1, 0.1), 0)):
-        strengths = np.where(np.array(low) < 1, low, 5.0) * sigma * edge
-        message = assert_undetermined(lambda s=strengths: require_patterns(*synthetic(s), sigma))  # type: ignore[misc]
-        assert f"only {found} independent pattern(s)" in message
-        assert "4 elements" in message
-
-
-def test_the_strength_of_a_pattern_counts_in_units_of_the_weights() -> None:
-    # Weight 4, inverse variance, doubles every strength; more noise than stated is sigma > 1.
-    edge = noise_edge(8, 9)
-    strengths = np.full(4, 0.6 * edge)
-    assert_undetermined(lambda: require_patterns(*synthetic(strengths), 1.0))  # type: ignore[arg-type]
-    require_patterns(*synthetic(strengths, weight=4.0), 1.0)  # type: ignore[arg-type]
-    assert_undetermined(lambda: require_patterns(*synthetic(strengths, weight=4.0), 1.3))  # type: ignore[arg-type]
-
-
-def test_where_rows_are_fewer_than_2m_they_bound_the_noise() -> None:
-    # Five rows and four elements: the noise fills five rows, not eight.
-    between = np.full(4, 0.5 * (noise_edge(5, 9) + noise_edge(8, 9)))
-    require_patterns(*synthetic(between, rows=5), 1.0)  # type: ignore[arg-type]
-    assert_undetermined(lambda: require_patterns(*synthetic(between, rows=60), 1.0))  # type: ignore[arg-type]
 
 
 def test_history_says_what_was_done_and_why() -> None:

@@ -7,14 +7,18 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet
+from wallmirror.derendering.bounds import Bound
 from wallmirror.derendering.estimate import Estimate, doubts_of_fit
 from wallmirror.derendering.knots import NOISY_STEPS, refine
-from wallmirror.derendering.noisy import require_patterns
+from wallmirror.derendering.patterns import trusted_bound
 from wallmirror.derendering.poisson import maximise_poisson, poisson_bound
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.subspace import SignalSpace
+
+Array = NDArray[np.float64]
 
 # Counts that scatter less than this share of what counting makes are none.
 _TOO_QUIET = 0.8
@@ -73,13 +77,16 @@ def solve_counts(
     )
     tell(f"Fisher scoring: {fit.gain:.3g} nats above the normal fit after {fit.iterations} steps")
     peak_at = grid.peak(fit.coefficients, level.summed.exposure)
-    bound = poisson_bound(
-        designs, fit.coefficients, fit.source, gauge=grid.row(peak_at), background=background, used=used
-    )
+
+    def bound_at(pattern: Array) -> Bound:
+        return poisson_bound(
+            designs, fit.coefficients, pattern * unit, gauge=grid.row(peak_at), background=background, used=used
+        )
+
     sigma = math.sqrt(max(1.0, fit.chi_squared))
     transport = np.stack([t @ fit.coefficients for t in designs], axis=1)
     source = fit.source / unit
-    require_patterns(problem, transport, source, sigma)
+    bound = trusted_bound(problem, level, transport, source, sigma=sigma, bound=bound_at(source), bound_at=bound_at)
     warnings = doubts_of_fit(converged=fit.converged, misfit=None)
     if fit.chi_squared > 1.2:
         warnings.append(

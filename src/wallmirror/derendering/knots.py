@@ -77,8 +77,11 @@ class Level:
     @cached_property
     def bound(self) -> Bound:
         """The Cramer-Rao bound at the fit, for noise of unit variance in units of the weights."""
-        gauge = self.grid.row(self.peak_at)
-        return cramer_rao(self.summed, self.fit.coefficients, self.fit.source, gauge=gauge)
+        return self.bound_at(self.fit.source)
+
+    def bound_at(self, source: Array) -> Bound:
+        """The bound at the fit's rho and another V, shape (M, B)."""
+        return cramer_rao(self.summed, self.fit.coefficients, source, gauge=self.grid.row(self.peak_at))
 
 
 @dataclass(frozen=True)

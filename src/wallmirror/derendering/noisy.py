@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from wallmirror.derendering.estimate import Estimate, doubts_of_fit, scale_free_error
 from wallmirror.derendering.knots import NOISY_STEPS, Refined, refine
-from wallmirror.derendering.problem import Problem, reduced_misfit, too_few_patterns
-from wallmirror.derendering.subspace import SignalSpace, noise_edge
+from wallmirror.derendering.patterns import trusted_bound
+from wallmirror.derendering.problem import Problem, reduced_misfit
+from wallmirror.derendering.subspace import SignalSpace
 
 Array = NDArray[np.float64]
 
@@ -49,13 +50,15 @@ def solve_noisy(
     """
     refined = refine(problem, space, steps, nonnegative=nonnegative, tolerance=tolerance, tell=tell)
     level, rival = refined.level, refined.rival
-    grid, fit, bound = level.grid, level.fit, level.bound
+    grid, fit = level.grid, level.fit
     transport = np.stack([t @ fit.coefficients for t in level.designs], axis=1)
     stated = problem.noise_is_stated
     reduced = reduced_misfit(problem, transport, fit.source, level.parameters + fit.source.size)
     # Where the noise is stated, a misfit beyond it widens the bars; where it is not, the misfit is the noise.
     sigma = math.sqrt(max(1.0, reduced) if stated else reduced)
-    require_patterns(problem, transport, fit.source, sigma)
+    bound = trusted_bound(
+        problem, level, transport, fit.source, sigma=sigma, bound=level.bound, bound_at=level.bound_at
+    )
     predicted = sigma * bound.source_error
     shape_std = sigma * bound.shape_std
     warnings: list[str] = []
@@ -101,27 +104,3 @@ def _still_falls(refined: Refined) -> bool:
     if before is None or before.objective < _PLATEAU * fit.objective:
         return False
     return rival is None or rival.objective < fit.objective / 2
-
-
-def require_patterns(problem: Problem, transport: Array, source: Array, sigma: float) -> None:
-    """Refuse a fit whose weakest pattern may be noise.
-
-    Were there one pattern less, the fit would have shaped one from noise. The term f v^T that it adds to the films has
-    an f that is a mixture of F's M columns, and F itself may only turn such that the patterns which are there stay:
-    M more numbers, as many as the pattern that trades with the BRDF has. So noise lends the term no larger a singular
-    value than that of a matrix of 2 M rows and B columns.
-
-    Parameters
-    ----------
-    transport, source:
-        F (P, M) and V (M, B) that were fitted.
-    sigma:
-        Standard deviation of the noise in units of the weights.
-    """
-    elements, realisations = source.shape
-    triangle = np.linalg.qr(problem.row_weights * transport, mode="r")
-    strength = np.linalg.svd(triangle @ source, compute_uv=False)
-    edge = noise_edge(min(2 * elements, problem.data.shape[0]), realisations)
-    found = int(np.count_nonzero(strength > sigma * edge))
-    if found < elements:
-        raise too_few_patterns(found, elements)

@@ -28,6 +28,10 @@ _RIDGE = 1e-13
 _NO_RIVAL = 0.01
 
 
+#: Quantiles of the law of Tracy and Widom for real matrices: passed once in ten thousand times, and once in a hundred.
+CERTAIN, LIKELY = 4.4, 2.02
+
+
 @dataclass(frozen=True)
 class SignalSpace:
     """The leading left singular space of the data.
@@ -114,15 +118,16 @@ def signal_space(data: Array, elements: int, *, noise_floor: float = 0.0) -> Sig
     return SignalSpace(q @ left[:, :elements], values, rank, data.shape[0])
 
 
-def noise_edge(rows: int, columns: int) -> float:
+def noise_edge(rows: int, columns: int, units: float = CERTAIN) -> float:
     """Singular value that noise of unit variance in a matrix of this size exceeds in one case of ten thousand.
 
-    The edge sqrt(rows) + sqrt(columns) of Marchenko and Pastur (1967), and beyond it 4.4 units of the scale on which the
-    largest eigenvalue scatters by the law of Tracy and Widom (Johnstone, Annals of Statistics 29(2), 2001).
+    The edge sqrt(rows) + sqrt(columns) of Marchenko and Pastur (1967), and beyond it some units of the scale on which the
+    largest eigenvalue scatters by the law of Tracy and Widom (Johnstone, Annals of Statistics 29(2), 2001): `CERTAIN`, or
+    `LIKELY` for one case of a hundred.
     """
     edge = math.sqrt(rows) + math.sqrt(columns)
     scale = edge * (1 / math.sqrt(rows) + 1 / math.sqrt(columns)) ** (1 / 3)
-    return math.sqrt(edge**2 + 4.4 * scale)
+    return math.sqrt(edge**2 + units * scale)
 
 
 def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noise: float | None) -> SignalSpace:
