@@ -167,7 +167,7 @@ def rough(rng: np.random.Generator) -> CookTorrance:
     )
 
 
-def judge(number: int, seed: int, facets: bool = False, wall: WallModel = "angle_sum") -> Outcome:
+def judge(number: int, seed: int, facets: bool = False, wall: WallModel = "auto") -> Outcome:
     """Solve one scene and hold the answer against the truth."""
     trial, decibels = draw(number, seed, facets)
     captures = trial.captures
@@ -208,12 +208,10 @@ def main() -> int:
     parser.add_argument(
         "--facets", action="store_true", help="walls of rough facets, for which Hypothesis 8 does not hold"
     )
-    parser.add_argument(
-        "--wall", choices=["angle_sum", "microfacet", "auto"], default="angle_sum", help="wall to solve for"
-    )
+    parser.add_argument("--wall", choices=["angle_sum", "microfacet", "auto"], default="auto", help="wall to solve for")
     arguments = parser.parse_args()
     out = arguments.out or (Path("out/false_confidence") if arguments.quick else Path(__file__).parent)
-    asked = ["facets"] * arguments.facets + [arguments.wall] * (arguments.wall != "angle_sum")
+    asked = ["facets"] * arguments.facets + [arguments.wall] * (arguments.wall != "auto")
     name = "_".join(["false_confidence", *asked])
     count = QUICK_SCENES if arguments.quick else SCENES
     started = time.perf_counter()

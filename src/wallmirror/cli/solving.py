@@ -34,9 +34,9 @@ def solve(
     wall: Annotated[
         str,
         typer.Option(
-            help="angle_sum, microfacet (two exponents more, for walls of rough facets), or auto: what the films require."
+            help="angle_sum, microfacet (rough facets: two exponents more), or auto: facets where the films ask for them."
         ),
-    ] = "angle_sum",
+    ] = "auto",
     nonnegative: Annotated[bool, typer.Option(help="Keep BRDF and pattern >= 0.")] = True,
     support_deg: Annotated[
         float | None, typer.Option(help="Few captures: the BRDF is 0 beyond this angle sum (degrees).")

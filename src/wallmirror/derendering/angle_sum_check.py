@@ -44,6 +44,8 @@ _NEIGHBOURS = 31
 LEVEL = 0.01
 #: A turn that the captures leave open beyond this many error bars is told.
 UNTOLD = 3.0
+#: A smaller one is in the bars and not worth a word.
+SLIGHT = 1e-3
 # Bars are widened to this share of the pattern at most: beyond it an answer counts as undetermined, and whether it is that
 # is for noise and geometry to say, not for a hypothesis that they cannot test.
 _WIDEST = 0.5
@@ -159,7 +161,7 @@ def _derivatives(
     """For each factor the change of the films that no r and V make, (P, B), and how V then turns, (M, B), per exponent."""
     grid, r, source = estimate.grid, estimate.coefficients, estimate.source
     kernel = problem.kernel(math.degrees(grid.step), _TOLERANCE)
-    designs = design_matrices(kernel, grid)
+    designs = estimate.designs or design_matrices(kernel, grid)
     data = moments(problem.data, designs, weights)
     schur, inverse, coupled = information(data, r, source)
     cells = np.flatnonzero(data.seen)
@@ -169,7 +171,8 @@ def _derivatives(
     schur[np.diag_indices_from(schur)] += _RIDGE * level
     lit = kernel.weight * grid.evaluate(r, kernel.angle_sum)
     films = [
-        np.sum(lit * logarithm(k, kernel), axis=-1).reshape(estimate.transport.shape) @ source for k in factors
+        np.sum(lit * logarithm(k, kernel.theta_s, kernel.theta_o), axis=-1).reshape(estimate.transport.shape) @ source
+        for k in factors
     ]  # (P, B) each
     unexplained, turns = [], []
     for film in films:
@@ -185,13 +188,23 @@ def _derivatives(
     return unexplained, turns
 
 
+#: Holds an estimate against walls with further factors.
+Check = Callable[[Problem, Estimate, tuple[Factor, ...]], AngleSumCheck]
+
+
 def fit_facets(
     problem: Problem,
     check: AngleSumCheck,
     fit: Callable[[Problem], Estimate],
     tell: Callable[[str], None] = lambda _: None,
+    again: Check = check_angle_sum,
 ) -> tuple[Problem, Estimate, AngleSumCheck]:
     """Fit a wall of facets: the exponents of `facets.FITTED` in turn with r and V, from a check of the angle sum.
+
+    Parameters
+    ----------
+    fit, again:
+        What finds r and V at given exponents, and the check that goes with it.
 
     Returns
     -------
@@ -201,10 +214,10 @@ def fit_facets(
         problem = replace(problem, exponents={k: check.exponents[k] for k in FITTED})
         tell(f"a wall of facets, {in_words(problem.exponents)}")
         estimate = fit(problem)
-        check = check_angle_sum(problem, estimate)
+        check = again(problem, estimate, FITTED)
         if check.bias < _SETTLED * math.hypot(estimate.predicted_error, check.open):
             break
-    return problem, estimate, check_angle_sum(problem, estimate, EVERY)
+    return problem, estimate, again(problem, estimate, EVERY)
 
 
 def in_words(exponents: Mapping[Any, float]) -> str:
@@ -229,12 +242,12 @@ def with_doubt(estimate: Estimate, check: AngleSumCheck) -> Estimate:
             if check.assumed
             else "Hypothesis 8 (angle sum) does not hold, or wrong geometry or light beyond one bounce looks like that"
         )
-        remedy = "" if check.assumed else '; try the wall "auto", which fits facets, or the general method'
+        remedy = "" if check.assumed else '; fit facets (wall "auto", no scale by an albedo), or use the general method'
         warnings = (
             f"{which}: a wall that depends on both angles fits better and turns the pattern by about "
             f"{100 * check.bias:.2g} %; the error bars were widened to match{remedy}",
         )
-    elif not check.assumed and check.open > UNTOLD * predicted:
+    elif not check.assumed and check.open > max(UNTOLD * predicted, SLIGHT):
         warnings = (
             "the captures cannot tell whether Hypothesis 8 (angle sum) holds: were the wall one of facets, the pattern "
             f"would be about {100 * check.open:.2g} % off, and the error bars were widened to that; use more pixels or "

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from wallmirror.derendering.splines import SplineGrid
@@ -39,6 +40,8 @@ class Estimate:
         What the answer rests on beside the captures, in words.
     groups:
         Elements that share a scale, each ascending, where there is more than the one global scale.
+    designs:
+        T_1 .. T_M on the grid, (P, K) each, where the method has them at hand.
     """
 
     method: str
@@ -56,6 +59,7 @@ class Estimate:
     warnings: tuple[str, ...]
     priors: tuple[str, ...] = ()
     groups: tuple[tuple[int, ...], ...] = ()
+    designs: list[sp.csr_array] = field(default_factory=list, repr=False)
 
 
 def doubts_of_fit(*, converged: bool, misfit: float | None) -> list[str]:

@@ -85,6 +85,7 @@ def solve_exactly(problem: Problem, space: SignalSpace, *, step_deg: float | Non
         predicted_error=error,
         chi_squared=math.nan,
         warnings=warnings,
+        designs=designs,
     )
 
 

@@ -69,9 +69,9 @@ _LOGARITHMS: dict[Factor, Callable[[Array, Array], Array]] = {
 }
 
 
-def logarithm(factor: Factor, kernel: Kernel) -> Array:
-    """log f at a kernel's nodes, broadcastable to (A, N, M, Q)."""
-    return _LOGARITHMS[factor](kernel.theta_s, kernel.theta_o)
+def logarithm(factor: Factor, theta_s: Array, theta_o: Array) -> Array:
+    """log f at angles in radians, of the shape that they broadcast to."""
+    return _LOGARITHMS[factor](theta_s, theta_o)
 
 
 def weighted(kernel: Kernel, exponents: Mapping[Factor, float]) -> Kernel:
@@ -80,5 +80,5 @@ def weighted(kernel: Kernel, exponents: Mapping[Factor, float]) -> Kernel:
         return kernel
     power = np.zeros(1)
     for factor, exponent in exponents.items():
-        power = power + exponent * logarithm(factor, kernel)
+        power = power + exponent * logarithm(factor, kernel.theta_s, kernel.theta_o)
     return replace(kernel, weight=kernel.weight * np.exp(power))

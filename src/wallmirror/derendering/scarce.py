@@ -66,6 +66,7 @@ def solve_scarce(
             chi_squared=math.nan,
             warnings=(),
             priors=tuple(priors),
+            designs=found.designs,
         )
     designs = found.designs
     summed = moments(problem.data, designs, problem.inverse_variance)
@@ -98,6 +99,7 @@ def solve_scarce(
         chi_squared=reduced if stated else math.nan,
         warnings=tuple(warnings),
         priors=tuple(priors),
+        designs=designs,
     )
 
 

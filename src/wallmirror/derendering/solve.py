@@ -15,11 +15,13 @@ from typing import Literal, TypedDict, cast, get_args
 from threadpoolctl import threadpool_limits
 
 from wallmirror.captures import CaptureSet
-from wallmirror.derendering.angle_sum_check import check_angle_sum, fit_facets, with_doubt
+from wallmirror.derendering.angle_sum_check import AngleSumCheck, Check, check_angle_sum, fit_facets, with_doubt
+from wallmirror.derendering.angle_sum_quiet import check_angle_sum_quietly
 from wallmirror.derendering.calibration import Calibration
 from wallmirror.derendering.counting import solve_counts, with_counting_noise
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.exact import solve_exactly
+from wallmirror.derendering.facets import FITTED, Factor
 from wallmirror.derendering.knots import NOISY_STEPS
 from wallmirror.derendering.noisy import solve_noisy
 from wallmirror.derendering.one_bounce import check_one_bounce
@@ -57,13 +59,17 @@ _NOISELESS = 1e-15
 _SILENT = 1e-20
 # Without noise the closed form is taken up to this error: a misfit that is no noise would give a likelihood false bars.
 _KNOWN = 0.1
+_NO_NOISE = (
+    "the captures are free of noise, so what the fit leaves of them is none, and its error bars, which take it for noise, "
+    "are too small by a factor that nothing tells; the closed form's own bound is what is known"
+)
 
 
 def solve(
     captures: CaptureSet,
     *,
     method: Method = "auto",
-    wall: WallModel = "angle_sum",
+    wall: WallModel = "auto",
     nonnegative: bool = True,
     support_deg: float | None = None,
     step_deg: float | None = None,
@@ -89,8 +95,8 @@ def solve(
         B < M, else the closed form when its own certificate finds no noise, else maximum likelihood.
     wall:
         "angle_sum" (Hypothesis 8: rho depends on the angle sum), "microfacet" (such a function times two factors of both
-        angles whose exponents are fitted, see `facets`; with maximum likelihood and for counts), or "auto": facets where the
-        films reject the angle sum.
+        angles whose exponents are fitted, see `facets`), or "auto": facets where the films reject the angle sum, and no
+        albedo settles the scale. Walls of the angle sum have the same answer with "auto" as without.
     nonnegative:
         Keep rho >= 0 and V >= 0, except in the closed form.
     support_deg:
@@ -136,7 +142,7 @@ def solve(
     few = method == "few_captures" or (method == "auto" and captures.realisations < captures.card.elements)
     if tolerance is not None and not 0 < tolerance < 1:
         raise InputError(f"is {tolerance:g}; give a relative error between 0 and 1", field="tolerance")
-    _check_wall(wall, method, few, scale)
+    _check_wall(wall, scale)
     _check_options(method, few, support_deg, step_deg, counts_per_radiance, background, seed)
     gauge = Gauge(scale=scale, wall_albedo=wall_albedo, source_level=source_level)
     steps = (step_deg,) if step_deg else None
@@ -173,23 +179,46 @@ def solve(
                 tell=tell,
             )
 
-        estimate = exact = None
+        def closed(problem: Problem) -> Estimate:
+            return solve_exactly(problem, space, step_deg=step_deg)
+
+        def scarce(problem: Problem) -> Estimate:
+            support = None if support_deg is None else math.radians(support_deg)
+            return solve_scarce(
+                problem, nonnegative=nonnegative, support=support, step_deg=step_deg, seed=seed, tell=tell
+            )
+
+        def quietly(problem: Problem, estimate: Estimate, factors: tuple[Factor, ...]) -> AngleSumCheck:
+            return check_angle_sum_quietly(problem, space, estimate, factors)
+
+        def hold(
+            problem: Problem, estimate: Estimate, fit: Callable[[Problem], Estimate], check: Check
+        ) -> tuple[Problem, Estimate, AngleSumCheck]:
+            """The estimate against walls of facets, and one of those in its place if that is asked for."""
+            found = check(problem, estimate, FITTED)
+            # The closed form's error is a bound, mostly a wide one: facets that turn the pattern by less are worth a fit too.
+            bars = min(estimate.predicted_error, found.open) if check is quietly else estimate.predicted_error
+            if wall == "microfacet" or (wall == "auto" and scale != "albedo" and found.rejects(bars)):
+                return fit_facets(problem, found, fit, tell, check)
+            return problem, estimate, found
+
+        estimate = exact = angle_sum = None
         quiet = False
         if few:
             tell(f"{captures.realisations} captures for {captures.card.elements} elements: search for few captures")
-            support = None if support_deg is None else math.radians(support_deg)
-            estimate = solve_scarce(
-                problem, nonnegative=nonnegative, support=support, step_deg=step_deg, seed=seed, tell=tell
-            )
+            estimate = scarce(problem)
         elif method == "closed_form" or (method == "auto" and _may_be_exact(problem, space)):
             tell(f"rank {space.rank} of {captures.card.elements}, no noise stated: closed form")
-            exact = solve_exactly(problem, space, step_deg=step_deg)
+            exact = closed(problem)
             # The singular values beyond M tell noise best: knots as fine as the pixels fit noise as well. Where there are
             # none beyond, a mismatch near rounding has to do.
             noise = expected_mismatch(problem, space, exact.closed)
             quiet = exact.closed.mismatch < _NOISELESS if math.isnan(noise) else noise < _SILENT
+            held = problem
+            if exact.designs and (quiet or method == "closed_form"):
+                held, exact, angle_sum = hold(problem, exact, closed, quietly)
             if method == "closed_form" or (quiet and exact.predicted_error <= _KNOWN):
-                estimate = exact
+                problem, estimate = held, exact
             else:
                 why = "its error bound is too large" if quiet else "there is noise"
                 tell(f"closed form misses the data by {exact.closed.mismatch:.1e}: {why}")
@@ -200,13 +229,13 @@ def solve(
             except UndeterminedError:
                 if not quiet or exact is None:
                     raise
-                estimate = exact  # refused below, and the closed form knows the better reason
-        angle_sum = None
-        if estimate.method in FITS and estimate.predicted_error <= UNDETERMINED:
-            angle_sum = check_angle_sum(problem, estimate)
-            if wall == "microfacet" or (wall == "auto" and angle_sum.rejects(estimate.predicted_error)):
-                problem, estimate, angle_sum = fit_facets(problem, angle_sum, fit, tell)
+                problem, estimate = held, exact  # refused below, and the closed form knows the better reason
+        if estimate.method != "closed_form" and estimate.predicted_error <= UNDETERMINED:
+            problem, estimate, angle_sum = hold(problem, estimate, scarce if few else fit, check_angle_sum)
+        if angle_sum is not None:
             estimate = with_doubt(estimate, angle_sum)
+        if quiet and estimate.method in FITS:
+            estimate = replace(estimate, warnings=(*estimate.warnings, _NO_NOISE))
         if calibration is not None:
             tell(f"the same with the card one standard deviation aside, {len(calibration.aside)} times")
             aside = [
@@ -235,15 +264,11 @@ def _may_be_exact(problem: Problem, space: SignalSpace) -> bool:
     return not problem.noise_is_stated and space.rank == problem.card.elements
 
 
-def _check_wall(wall: str, method: str, few: bool, scale: str) -> None:
+def _check_wall(wall: str, scale: str) -> None:
     if wall not in get_args(WallModel):
         raise InputError(f'is "{wall}"; choose one of {", ".join(get_args(WallModel))}', field="wall")
-    if wall != "angle_sum" and (few or method == "closed_form"):
-        raise InputError(
-            "can be no other than angle_sum in the closed form and for few captures; leave it out", field="wall"
-        )
-    if wall != "angle_sum" and scale == "albedo":
-        raise InputError("can be no other than angle_sum where an albedo settles the scale", field="wall")
+    if wall == "microfacet" and scale == "albedo":
+        raise InputError("cannot be microfacet where an albedo settles the scale", field="wall")
 
 
 def _check_options(
