@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from wallmirror.brdf import BRDF, AngleSumBRDF, CookTorrance, Diffuse, Fresnel, Phong, Schlick, Sum
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering import angle_sum_check
-from wallmirror.derendering.angle_sum_check import check_angle_sum, fit_facets, with_doubt
+from wallmirror.derendering.angle_sum_check import check_angle_sum, with_doubt
 from wallmirror.derendering.estimate import Estimate, scale_free_error
+from wallmirror.derendering.facet_fit import fit_facets
 from wallmirror.derendering.facets import EVERY, FITTED, weighted
 from wallmirror.derendering.knots import NOISY_STEPS
 from wallmirror.derendering.noisy import solve_noisy
@@ -202,7 +203,7 @@ def test_a_dielectric_that_two_factors_do_not_explain_is_told_after_the_fit() ->
     def fit(problem: Problem) -> Estimate:
         return solve_noisy(problem, space, (2.0,))
 
-    _, alone, check = fit_facets(problem, check_angle_sum(problem, fit(problem)), fit)
+    _, alone, check = fit_facets(problem, check_angle_sum(problem, fit(problem)), fit, check_angle_sum)
     assert tuple(check.exponents) == EVERY
     told = with_doubt(alone, check)
     off = scale_free_error(alone.source, SOURCE)

@@ -17,7 +17,7 @@ what the captures cannot tell of them must not count as known: what is left of i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,7 +28,7 @@ from scipy.stats import f as f_distribution
 
 from wallmirror.derendering.convex import solve_positive
 from wallmirror.derendering.estimate import Estimate
-from wallmirror.derendering.facets import EVERY, FITTED, PRIOR_STD, Factor, logarithm
+from wallmirror.derendering.facets import FITTED, PRIOR_STD, Factor, logarithm
 from wallmirror.derendering.likelihood import information
 from wallmirror.derendering.moments import moments
 from wallmirror.derendering.problem import Problem
@@ -49,9 +49,6 @@ SLIGHT = 1e-3
 # Bars are widened to this share of the pattern at most: beyond it an answer counts as undetermined, and whether it is that
 # is for noise and geometry to say, not for a hypothesis that they cannot test.
 _WIDEST = 0.5
-# Rounds of fit and check after which the exponents are taken as they are, and the turn, in error bars, that ends them.
-_ROUNDS = 4
-_SETTLED = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,38 +183,6 @@ def _derivatives(
         unexplained.append(film - moved @ source - estimate.transport @ dv)
         turns.append(-dv + source * (np.sum(dv * source) / np.sum(source**2)))
     return unexplained, turns
-
-
-#: Holds an estimate against walls with further factors.
-Check = Callable[[Problem, Estimate, tuple[Factor, ...]], AngleSumCheck]
-
-
-def fit_facets(
-    problem: Problem,
-    check: AngleSumCheck,
-    fit: Callable[[Problem], Estimate],
-    tell: Callable[[str], None] = lambda _: None,
-    again: Check = check_angle_sum,
-) -> tuple[Problem, Estimate, AngleSumCheck]:
-    """Fit a wall of facets: the exponents of `facets.FITTED` in turn with r and V, from a check of the angle sum.
-
-    Parameters
-    ----------
-    fit, again:
-        What finds r and V at given exponents, and the check that goes with it.
-
-    Returns
-    -------
-    The problem with the exponents, the estimate at them, and its check against all factors.
-    """
-    for _ in range(_ROUNDS):
-        problem = replace(problem, exponents={k: check.exponents[k] for k in FITTED})
-        tell(f"a wall of facets, {in_words(problem.exponents)}")
-        estimate = fit(problem)
-        check = again(problem, estimate, FITTED)
-        if check.bias < _SETTLED * math.hypot(estimate.predicted_error, check.open):
-            break
-    return problem, estimate, again(problem, estimate, EVERY)
 
 
 def in_words(exponents: Mapping[Any, float]) -> str:

@@ -10,18 +10,20 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Literal, TypedDict, cast, get_args
 
 from threadpoolctl import threadpool_limits
 
 from wallmirror.captures import CaptureSet
-from wallmirror.derendering.angle_sum_check import AngleSumCheck, Check, check_angle_sum, fit_facets, with_doubt
+from wallmirror.derendering.angle_sum_check import AngleSumCheck, check_angle_sum, with_doubt
 from wallmirror.derendering.angle_sum_quiet import check_angle_sum_quietly
 from wallmirror.derendering.calibration import Calibration
 from wallmirror.derendering.counting import solve_counts, with_counting_noise
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.exact import solve_exactly
-from wallmirror.derendering.facets import FITTED, Factor
+from wallmirror.derendering.facet_fit import WallModel, settle_wall
+from wallmirror.derendering.facets import Factor
 from wallmirror.derendering.knots import NOISY_STEPS
 from wallmirror.derendering.noisy import solve_noisy
 from wallmirror.derendering.one_bounce import check_one_bounce
@@ -33,7 +35,6 @@ from wallmirror.derendering.subspace import SignalSpace
 from wallmirror.errors import InputError, UndeterminedError
 
 Method = Literal["auto", "closed_form", "maximum_likelihood", "few_captures", "poisson"]
-WallModel = Literal["angle_sum", "microfacet", "auto"]
 
 
 class SolveOptions(TypedDict, total=False):
@@ -180,7 +181,10 @@ def solve(
             )
 
         def closed(problem: Problem) -> Estimate:
-            return solve_exactly(problem, space, step_deg=step_deg)
+            found = solve_exactly(problem, space, step_deg=step_deg)
+            if problem.exponents and found.closed.near_solutions > 1:
+                raise UndeterminedError("several BRDFs of a wall of facets explain the captures equally well")
+            return found
 
         def scarce(problem: Problem) -> Estimate:
             support = None if support_deg is None else math.radians(support_deg)
@@ -191,17 +195,8 @@ def solve(
         def quietly(problem: Problem, estimate: Estimate, factors: tuple[Factor, ...]) -> AngleSumCheck:
             return check_angle_sum_quietly(problem, space, estimate, factors)
 
-        def hold(
-            problem: Problem, estimate: Estimate, fit: Callable[[Problem], Estimate], check: Check
-        ) -> tuple[Problem, Estimate, AngleSumCheck]:
-            """The estimate against walls of facets, and one of those in its place if that is asked for."""
-            found = check(problem, estimate, FITTED)
-            # The closed form's error is a bound, mostly a wide one: facets that turn the pattern by less are worth a fit too.
-            bars = min(estimate.predicted_error, found.open) if check is quietly else estimate.predicted_error
-            if wall == "microfacet" or (wall == "auto" and scale != "albedo" and found.rejects(bars)):
-                return fit_facets(problem, found, fit, tell, check)
-            return problem, estimate, found
-
+        # A scale that an albedo settles is that of a function of the angle sum.
+        settle = partial(settle_wall, wall="angle_sum" if wall == "auto" and scale == "albedo" else wall, tell=tell)
         estimate = exact = angle_sum = None
         quiet = False
         if few:
@@ -215,8 +210,8 @@ def solve(
             noise = expected_mismatch(problem, space, exact.closed)
             quiet = exact.closed.mismatch < _NOISELESS if math.isnan(noise) else noise < _SILENT
             held = problem
-            if exact.designs and (quiet or method == "closed_form"):
-                held, exact, angle_sum = hold(problem, exact, closed, quietly)
+            if exact.closed.near_solutions == 1 and (quiet or method == "closed_form"):
+                held, exact, angle_sum = settle(problem, exact, closed, quietly, bounded=True)
             if method == "closed_form" or (quiet and exact.predicted_error <= _KNOWN):
                 problem, estimate = held, exact
             else:
@@ -231,7 +226,12 @@ def solve(
                     raise
                 problem, estimate = held, exact  # refused below, and the closed form knows the better reason
         if estimate.method != "closed_form" and estimate.predicted_error <= UNDETERMINED:
-            problem, estimate, angle_sum = hold(problem, estimate, scarce if few else fit, check_angle_sum)
+            problem, estimate, angle_sum = settle(problem, estimate, scarce if few else fit, check_angle_sum)
+        if wall == "microfacet" and estimate.groups:
+            raise UndeterminedError(
+                "a scale is open for each group of elements, and with it the exponents of a wall of facets; use a card or views "
+                "whose reflections share more angles"
+            )
         if angle_sum is not None:
             estimate = with_doubt(estimate, angle_sum)
         if quiet and estimate.method in FITS:
