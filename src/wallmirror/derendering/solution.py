@@ -239,9 +239,15 @@ def conclude(
     angle_sum: AngleSumCheck | None,
     *,
     gauge: Gauge,
+    quiet: bool,
     seconds: Callable[[], float],
 ) -> Solution:
     """Put an estimate into the gauge that was chosen, attach its certificates and say in words how far to trust it.
+
+    Parameters
+    ----------
+    quiet:
+        Whether the captures show themselves that they have no noise.
 
     Raises
     ------
@@ -286,6 +292,12 @@ def conclude(
             f"another BRDF misses the captures' space hardly more than the one found ({closed.gap:.1e} against "
             f"{closed.mismatch:.1e}), so the pattern may be a wholly different one; use views or a card whose reflections "
             "share more angles"
+        )
+    if quiet and estimate.method in FITS:
+        warnings.append(
+            "the captures are free of noise, so what the fit leaves of them is none, and its error bars, which take it for "
+            "noise, are too small by a factor that nothing tells; use more views or pixels, for which the closed form has a "
+            "bound"
         )
     if one_bounce is not None and one_bounce.bias > _BIAS_TOLD * estimate.predicted_error:
         basis = "assumed" if one_bounce.assumed else "given"

@@ -30,7 +30,7 @@ from wallmirror.derendering.one_bounce import check_one_bounce
 from wallmirror.derendering.placed import widened
 from wallmirror.derendering.problem import Problem, expected_mismatch, prepare
 from wallmirror.derendering.scarce import solve_scarce
-from wallmirror.derendering.solution import FITS, UNDETERMINED, Gauge, Scale, Solution, conclude
+from wallmirror.derendering.solution import UNDETERMINED, Gauge, Scale, Solution, conclude
 from wallmirror.derendering.subspace import SignalSpace
 from wallmirror.errors import InputError, UndeterminedError
 
@@ -60,10 +60,6 @@ _NOISELESS = 1e-15
 _SILENT = 1e-20
 # Without noise the closed form is taken up to this error: a misfit that is no noise would give a likelihood false bars.
 _KNOWN = 0.1
-_NO_NOISE = (
-    "the captures are free of noise, so what the fit leaves of them is none, and its error bars, which take it for noise, "
-    "are too small by a factor that nothing tells; the closed form's own bound is what is known"
-)
 
 
 def solve(
@@ -229,13 +225,11 @@ def solve(
             problem, estimate, angle_sum = settle(problem, estimate, scarce if few else fit, check_angle_sum)
         if wall == "microfacet" and estimate.groups:
             raise UndeterminedError(
-                "a scale is open for each group of elements, and with it the exponents of a wall of facets; use a card or views "
-                "whose reflections share more angles"
+                "a scale is open for each group of elements, and with it the exponents of a wall of facets; use views or a "
+                "card whose reflections share more angles"
             )
         if angle_sum is not None:
             estimate = with_doubt(estimate, angle_sum)
-        if quiet and estimate.method in FITS:
-            estimate = replace(estimate, warnings=(*estimate.warnings, _NO_NOISE))
         if calibration is not None:
             tell(f"the same with the card one standard deviation aside, {len(calibration.aside)} times")
             aside = [
@@ -255,7 +249,14 @@ def solve(
             estimate = widened(problem, estimate, aside)
         check = check_one_bounce(problem, estimate, wall_albedo=wall_albedo)
         solution = conclude(
-            problem, space, estimate, check, angle_sum, gauge=gauge, seconds=lambda: time.perf_counter() - started
+            problem,
+            space,
+            estimate,
+            check,
+            angle_sum,
+            gauge=gauge,
+            quiet=quiet,
+            seconds=lambda: time.perf_counter() - started,
         )
         return replace(solution, history=tuple(history))
 
