@@ -16,9 +16,11 @@ from wallmirror.derendering.angle_sum_check import LEVEL, SLIGHT, AngleSumCheck,
 from wallmirror.derendering.angle_sum_quiet import check_angle_sum_quietly
 from wallmirror.derendering.estimate import Estimate, scale_free_error
 from wallmirror.derendering.exact import solve_exactly
-from wallmirror.derendering.facets import FITTED, weighted
-from wallmirror.derendering.problem import prepare
+from wallmirror.derendering.facet_fit import settle_wall
+from wallmirror.derendering.facets import FITTED, Factor, weighted
+from wallmirror.derendering.problem import Problem, prepare
 from wallmirror.derendering.solve import solve
+from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card, Observer, scan_angles
 from wallmirror.transport import Weights, build_kernel, radiance, transport_matrix
 
@@ -194,3 +196,57 @@ def test_few_captures_of_facets_are_told_and_fitted(noise: float) -> None:
     better, _, check, predicted, _ = of_few(FACETS, noise, "auto")
     assert set(check.assumed) == set(FITTED)
     assert scale_free_error(better, source) < min(off, 5 * predicted)
+
+
+# -- which wall an answer rests on -----------------------------------------------------------------------------
+
+
+def test_facets_that_nothing_determines_leave_the_angle_sum_with_its_doubt_unless_they_were_asked_for() -> None:
+    captures, _ = filmed(CLOSE, FACETS, 6)
+    problem, space = prepare(captures)
+    estimate = solve_exactly(problem, space)
+    told: list[str] = []
+
+    def fit(problem: Problem) -> Estimate:
+        raise UndeterminedError("nothing determines them")
+
+    def check(problem: Problem, estimate: Estimate, factors: tuple[Factor, ...]) -> AngleSumCheck:
+        return check_angle_sum_quietly(problem, space, estimate, factors)
+
+    stays, same, found = settle_wall(problem, estimate, fit, check, wall="auto", tell=told.append)
+    assert stays is problem
+    assert same is estimate
+    assert "Hypothesis 8" in with_doubt(same, found).warnings[0]
+    assert "nothing determines them" in told[-1]
+    with pytest.raises(UndeterminedError):
+        settle_wall(problem, estimate, fit, check, wall="microfacet")
+
+
+def test_facets_are_not_fitted_to_what_light_beyond_one_bounce_is_foretold_to_do() -> None:
+    captures, _ = filmed(CLOSE, FACETS, 6)
+    problem, space = prepare(captures)
+    estimate = solve_exactly(problem, space)
+    bias = check_angle_sum_quietly(problem, space, estimate).bias
+
+    def settled(foretold: float) -> bool:
+        held, _, _ = settle_wall(
+            problem,
+            estimate,
+            lambda problem: solve_exactly(problem, space),
+            lambda *held: check_angle_sum_quietly(held[0], space, *held[1:]),
+            wall="auto",
+            foretold=lambda *_: foretold,
+        )
+        return bool(held.exponents)
+
+    assert settled(0.1 * bias)
+    assert not settled(bias)
+
+
+def test_an_albedo_that_settles_the_scale_keeps_the_angle_sum() -> None:
+    captures, _ = filmed(CLOSE, FACETS, 6)
+    plain = solve(captures, wall="angle_sum")
+    by_albedo = solve(captures, scale="albedo", wall_albedo=0.5)
+    assert by_albedo.angle_sum_check is not None
+    assert not by_albedo.angle_sum_check.assumed
+    assert by_albedo.warnings == plain.warnings

@@ -201,7 +201,8 @@ def with_doubt(estimate: Estimate, check: AngleSumCheck) -> Estimate:
     whole = min(whole, max(predicted, _WIDEST))
     known = math.hypot(predicted, check.open) if check.assumed else predicted
     warnings: tuple[str, ...] = ()
-    if check.rejects(known):
+    # What is left beside fitted facets is a refinement of theirs: a slight turn is in the bars and says no more.
+    if check.rejects(max(known, SLIGHT) if check.assumed else known):
         which = (
             "the wall of facets that was fitted does not explain the films either"
             if check.assumed

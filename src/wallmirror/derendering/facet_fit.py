@@ -26,6 +26,8 @@ Check = Callable[[Problem, Estimate, tuple[Factor, ...]], AngleSumCheck]
 # Rounds of fit and check after which the exponents are taken as they are, and the turn, in error bars, that ends them.
 _ROUNDS = 4
 _SETTLED = 0.1
+# Share of a turn from which on a forecast, which holds within a factor of two, may be all of it.
+_EXCUSED = 0.5
 
 
 def settle_wall(
@@ -36,6 +38,7 @@ def settle_wall(
     *,
     wall: WallModel,
     bounded: bool = False,
+    foretold: Callable[[Problem, Estimate], float] = lambda problem, estimate: 0.0,
     tell: Callable[[str], None] = lambda _: None,
 ) -> tuple[Problem, Estimate, AngleSumCheck]:
     """Hold an angle-sum estimate against walls of facets, and put one in its place if asked to or, with "auto", if it must be.
@@ -45,6 +48,9 @@ def settle_wall(
     bounded:
         Whether the estimate's error is a bound, as the closed form's is, and mostly a wide one: then facets that turn the
         pattern by less are worth a fit too.
+    foretold:
+        The turn of the pattern that is foretold from the geometry, by light beyond one bounce: facets would take it up, so
+        that "auto" fits none where it may be what the check has found.
 
     Returns
     -------
@@ -59,7 +65,7 @@ def settle_wall(
     if wall == "microfacet":
         return fit_facets(problem, found, fit, check, tell)
     bars = min(estimate.predicted_error, found.open) if bounded else estimate.predicted_error
-    if wall == "auto" and found.rejects(bars):
+    if wall == "auto" and found.rejects(bars) and foretold(problem, estimate) < _EXCUSED * found.bias:
         try:
             return fit_facets(problem, found, fit, check, tell)
         except UndeterminedError as refusal:

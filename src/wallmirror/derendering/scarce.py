@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
 
 from wallmirror.derendering.bounds import cramer_rao
+from wallmirror.derendering.elimination import restricted
 from wallmirror.derendering.estimate import Estimate, doubts_of_fit
 from wallmirror.derendering.few_captures import STEPS, few_captures
 from wallmirror.derendering.likelihood import Fit, best_nonnegative, maximise, moments
 from wallmirror.derendering.problem import Problem, reduced_misfit
 from wallmirror.derendering.splines import SplineGrid
+from wallmirror.derendering.subspace import ClosedForm
+
+Array = NDArray[np.float64]
 
 # A residual below this is a spline's own error or rounding, and no noise that a likelihood could weigh.
 _NOISELESS = 1e-6
@@ -68,14 +75,49 @@ def solve_scarce(
             priors=tuple(priors),
             designs=found.designs,
         )
-    designs = found.designs
+    return _weighed(
+        problem, grid, found.designs, found.source, found.closed, priors, nonnegative=nonnegative, support=support
+    )
+
+
+def refit_scarce(problem: Problem, before: Estimate, *, nonnegative: bool, support: float | None) -> Estimate:
+    """The maximum of the likelihood next to a pattern that was found for another wall: no search, and no other knots.
+
+    Parameters
+    ----------
+    before:
+        Of `solve_scarce`, for other exponents of the wall's factors (`facets`).
+    """
+    step = math.degrees(before.grid.step)
+    grid, designs = problem.designs(step, degree=before.grid.degree, tolerance=1e-9)
+    designs = restricted(grid, designs, support)
+    return _weighed(
+        problem, grid, designs, before.source, before.closed, before.priors, nonnegative=nonnegative, support=support
+    )
+
+
+def _weighed(
+    problem: Problem,
+    grid: SplineGrid,
+    designs: list[sp.csr_array],
+    source: Array,
+    closed: ClosedForm,
+    priors: Sequence[str],
+    *,
+    nonnegative: bool,
+    support: float | None,
+) -> Estimate:
+    """The maximum of the likelihood next to a pattern, with its bound and its doubts."""
     summed = moments(problem.data, designs, problem.inverse_variance)
-    fit = maximise(summed, best_nonnegative(summed, found.source), nonnegative=nonnegative)
+    fit = maximise(summed, best_nonnegative(summed, source), nonnegative=nonnegative)
     transport = np.stack([t @ fit.coefficients for t in designs], axis=1)
     unknowns = int(np.count_nonzero(fit.coefficients)) + fit.source.size
     reduced = reduced_misfit(problem, transport, fit.source, unknowns)
     stated = problem.noise_is_stated
     sigma = math.sqrt(max(1.0, reduced) if stated else reduced)
+    weights = problem.row_weights
+    missed = float(np.linalg.norm(weights * (problem.data - transport @ fit.source)))
+    missed /= float(np.linalg.norm(problem.weighted_data))
     peak_at = grid.peak(fit.coefficients, summed.exposure)
     bound = cramer_rao(summed, fit.coefficients, fit.source, gauge=grid.row(peak_at))
     warnings = doubts_of_fit(converged=fit.converged, misfit=reduced if stated else None)
@@ -87,7 +129,7 @@ def solve_scarce(
     return Estimate(
         method="few_captures",
         grid=grid,
-        closed=found.closed,
+        closed=replace(closed, mismatch=missed**2),
         coefficients=fit.coefficients,
         source=fit.source,
         transport=transport,

@@ -29,7 +29,7 @@ from wallmirror.derendering.noisy import solve_noisy
 from wallmirror.derendering.one_bounce import check_one_bounce
 from wallmirror.derendering.placed import widened
 from wallmirror.derendering.problem import Problem, expected_mismatch, prepare
-from wallmirror.derendering.scarce import solve_scarce
+from wallmirror.derendering.scarce import refit_scarce, solve_scarce
 from wallmirror.derendering.solution import UNDETERMINED, Gauge, Scale, Solution, conclude
 from wallmirror.derendering.subspace import SignalSpace
 from wallmirror.errors import InputError, UndeterminedError
@@ -92,8 +92,9 @@ def solve(
         B < M, else the closed form when its own certificate finds no noise, else maximum likelihood.
     wall:
         "angle_sum" (Hypothesis 8: rho depends on the angle sum), "microfacet" (such a function times two factors of both
-        angles whose exponents are fitted, see `facets`), or "auto": facets where the films reject the angle sum, and no
-        albedo settles the scale. Walls of the angle sum have the same answer with "auto" as without.
+        angles whose exponents are fitted, see `facets`), or "auto": facets where the films reject the angle sum, no light
+        beyond one bounce is foretold to look like that, and no albedo settles the scale. Where they do not reject it, the
+        answer is that of "angle_sum".
     nonnegative:
         Keep rho >= 0 and V >= 0, except in the closed form.
     support_deg:
@@ -182,22 +183,29 @@ def solve(
                 raise UndeterminedError("several BRDFs of a wall of facets explain the captures equally well")
             return found
 
-        def scarce(problem: Problem) -> Estimate:
-            support = None if support_deg is None else math.radians(support_deg)
-            return solve_scarce(
-                problem, nonnegative=nonnegative, support=support, step_deg=step_deg, seed=seed, tell=tell
-            )
-
         def quietly(problem: Problem, estimate: Estimate, factors: tuple[Factor, ...]) -> AngleSumCheck:
             return check_angle_sum_quietly(problem, space, estimate, factors)
 
-        # A scale that an albedo settles is that of a function of the angle sum.
-        settle = partial(settle_wall, wall="angle_sum" if wall == "auto" and scale == "albedo" else wall, tell=tell)
+        def foretold(problem: Problem, estimate: Estimate) -> float:
+            further = check_one_bounce(problem, estimate, wall_albedo=wall_albedo)
+            return 0.0 if further is None else further.bias
+
+        settle = partial(
+            settle_wall,
+            # A scale that an albedo settles is that of a function of the angle sum.
+            wall="angle_sum" if wall == "auto" and scale == "albedo" else wall,
+            foretold=foretold,
+            tell=tell,
+        )
         estimate = exact = angle_sum = None
         quiet = False
         if few:
             tell(f"{captures.realisations} captures for {captures.card.elements} elements: search for few captures")
-            estimate = scarce(problem)
+            support = None if support_deg is None else math.radians(support_deg)
+            estimate = solve_scarce(
+                problem, nonnegative=nonnegative, support=support, step_deg=step_deg, seed=seed, tell=tell
+            )
+            refit = partial(refit_scarce, before=estimate, nonnegative=nonnegative, support=support)
         elif method == "closed_form" or (method == "auto" and _may_be_exact(problem, space)):
             tell(f"rank {space.rank} of {captures.card.elements}, no noise stated: closed form")
             exact = closed(problem)
@@ -222,7 +230,7 @@ def solve(
                     raise
                 problem, estimate = held, exact  # refused below, and the closed form knows the better reason
         if estimate.method != "closed_form" and estimate.predicted_error <= UNDETERMINED:
-            problem, estimate, angle_sum = settle(problem, estimate, scarce if few else fit, check_angle_sum)
+            problem, estimate, angle_sum = settle(problem, estimate, refit if few else fit, check_angle_sum)
         if wall == "microfacet" and estimate.groups:
             raise UndeterminedError(
                 "a scale is open for each group of elements, and with it the exponents of a wall of facets; use views or a "
