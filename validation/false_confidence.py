@@ -1,11 +1,12 @@
 """Is an answer that is called good ever wrong, and is what can be known found?
 
-    python validation/false_confidence.py [--quick] [--jobs N] [--seed S] [--out FOLDER]
+    python validation/false_confidence.py [--facets] [--wall MODEL] [--quick] [--jobs N] [--seed S] [--out FOLDER]
 
 Draws random scenes (2 to 6 elements, 1 to 7 views, all three weights, four kinds of wall, from no noise down to 10 dB,
 with and without stated variances), a third of them spoilt so that nothing can determine the answer, solves each, and
 holds the answer against the truth. An answer is FALSE CONFIDENCE if the solver calls it good and its pattern is off by
-more than five of its own error bars + 1e-6. With --facets the walls are rough facets, and the angle sum a wrong model.
+more than five of its own error bars + 1e-6. With --facets the walls are rough facets, and the angle sum a wrong model;
+with --wall angle_sum none are fitted to the films that ask for them, and doubt is all that can save an answer.
 A scene counts as identifiable if the Cramer-Rao bound at the truth, which knows nothing of the solver, lets the pattern be
 known to 5 %. Leaves results/false_confidence.json (with the options in its name) in the folder and with 1 if there is
 false confidence or if fewer than 97 % of the identifiable scenes are solved.

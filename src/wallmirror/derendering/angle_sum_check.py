@@ -12,6 +12,8 @@ variances that were estimated from the same few samples as the films lie low whe
 of eight standard deviations. W is the inverse of the variance averaged over realisations and neighbouring pixels, and the
 scatter of s is taken from the films themselves, row by row (White, Econometrica 48(4), 1980). Exponents have a prior, as
 what the captures cannot tell of them must not count as known: what is left of it is how far the pattern may turn unseen.
+That is a standard deviation, as the bars are which it widens: five bars hold more than the largest departure that a test at
+its level can miss (2.6 of them).
 """
 
 from __future__ import annotations

@@ -144,7 +144,8 @@ class Solution:
         Elements (counted from 0) of each such part. With several, V, F and rho of each are in the scale in which its own
         well-seen part of the BRDF peaks at 1, errors hold up to one scale each, and `scale_free_error` takes the groups.
     predicted_error:
-        Expected relative error of V after the best global scale, from the Cramer-Rao bound.
+        Expected relative error of V after the best global scale, from the Cramer-Rao bound (or the closed form's own) and
+        from what a wall of facets could do to V that the captures do not rule out.
     residual:
         |D - F V| / |D|.
     chi_squared:
@@ -155,7 +156,7 @@ class Solution:
         What light beyond one bounce would do to this solution; None where nothing but the wall reflects.
     angle_sum_check:
         What a wall that is no function of the angle sum would do to this solution, and the factors that `brdf` is to be
-        multiplied with where a wall of facets was fitted; None where the method has no such check.
+        multiplied with where a wall of facets was fitted; None where groups of elements have a scale each.
     seconds:
         Time the solver took.
     history:
