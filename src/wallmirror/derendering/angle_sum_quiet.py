@@ -40,7 +40,7 @@ _ROUNDS = 30
 
 
 def check_angle_sum_quietly(
-    problem: Problem, space: SignalSpace, estimate: Estimate, factors: tuple[Factor, ...] = FITTED
+    problem: Problem, estimate: Estimate, factors: tuple[Factor, ...] = FITTED, *, space: SignalSpace
 ) -> AngleSumCheck:
     """Hold a closed form against walls with further factors, by a closed form at each.
 
@@ -50,6 +50,8 @@ def check_angle_sum_quietly(
         Of `exact.solve_exactly`, with its designs.
     factors:
         Those whose exponents may differ from the ones that `problem` assumes.
+    space:
+        Of the data.
     """
     designs = problem.weighted(estimate.designs)
     here = estimate.closed

@@ -14,6 +14,7 @@ from wallmirror.derendering.estimate import Estimate, scale_free_error
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form
+from wallmirror.errors import UndeterminedError
 
 Array = NDArray[np.float64]
 
@@ -45,9 +46,16 @@ def solve_exactly(problem: Problem, space: SignalSpace, *, step_deg: float | Non
     by the condition of F, and how far the pattern moves on the next-best knots. Where no other knots have an answer
     worth the name, the bound on r is multiplied by the condition instead. Where several BRDFs explain the captures because
     groups of elements share no angle, the answer is each group's up to a scale of its own (`separate`).
+
+    Raises
+    ------
+    UndeterminedError
+        When several BRDFs of a wall of facets explain the captures, whose exponents hang on the scales that are open.
     """
     best, others = _search(problem, space, step_deg)
     grid, closed, designs = best.grid, best.closed, best.designs
+    if problem.exponents and closed.near_solutions > 1:
+        raise UndeterminedError(f"{closed.near_solutions} BRDFs of a wall of facets explain the captures equally well")
     if closed.near_solutions > 1:
         separated = separate(problem.captures, problem.weighted_data, problem.weighted(designs), grid, closed)
         if separated is not None:

@@ -270,3 +270,15 @@ def reduced_misfit(problem: Problem, transport: Array, source: Array, parameters
     weights = problem.inverse_variance if problem.inverse_variance is not None else np.ones(1)
     counted = np.where(problem.noisy, weights * (problem.data - transport @ source) ** 2, 0.0)
     return float(np.sum(counted)) / max(1, int(np.count_nonzero(problem.noisy)) - parameters)
+
+
+def smoothness(problem: Problem, transport: Array, source: Array) -> float:
+    """Correlation of neighbouring pixels in D - F V: near 0 where it is noise, near 1 where the model misses the films.
+
+    Parameters
+    ----------
+    transport, source:
+        F (P, M) and V (M, B).
+    """
+    missed = (problem.row_weights * (problem.data - transport @ source)).reshape(problem.captures.radiance.shape)
+    return float(np.sum(missed[:, 1:] * missed[:, :-1]) / max(float(np.sum(missed**2)), 1e-300))

@@ -15,7 +15,7 @@ from wallmirror.derendering.elimination import restricted
 from wallmirror.derendering.estimate import Estimate, doubts_of_fit
 from wallmirror.derendering.few_captures import STEPS, few_captures
 from wallmirror.derendering.likelihood import Fit, best_nonnegative, maximise, moments
-from wallmirror.derendering.problem import Problem, reduced_misfit
+from wallmirror.derendering.problem import Problem, reduced_misfit, smoothness
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm
 
@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 _NOISELESS = 1e-6
 # Misfit that each coefficient beyond the support takes away, in units of the noise, from which on it is no chance.
 _BEYOND = 5.0
+# Correlation of neighbouring pixels beyond which a misfit is no noise, and beyond which it is no chance, in units of
+# 1 / sqrt(pixels), by which that of independent ones scatters.
+_SMOOTH, _CHANCE = 0.25, 5.0
 
 
 def solve_scarce(
@@ -121,6 +124,12 @@ def _weighed(
     peak_at = grid.peak(fit.coefficients, summed.exposure)
     bound = cramer_rao(summed, fit.coefficients, fit.source, gauge=grid.row(peak_at))
     warnings = doubts_of_fit(converged=fit.converged, misfit=reduced if stated else None)
+    chance = _CHANCE / math.sqrt(summed.observations)
+    if not stated and smoothness(problem, transport, fit.source) > max(_SMOOTH, chance):
+        warnings.append(
+            "what the fit leaves of the captures is alike in neighbouring pixels, so it is no noise, and the error bars, which "
+            "take it for noise, may be too small"
+        )
     if support is not None and _reaches_beyond(problem, grid, fit):
         warnings.append(
             f"the captures are explained far better by a BRDF that reaches beyond {math.degrees(support):g} deg, so the "

@@ -16,14 +16,13 @@ from typing import Literal, TypedDict, cast, get_args
 from threadpoolctl import threadpool_limits
 
 from wallmirror.captures import CaptureSet
-from wallmirror.derendering.angle_sum_check import AngleSumCheck, check_angle_sum, with_doubt
+from wallmirror.derendering.angle_sum_check import check_angle_sum, with_doubt
 from wallmirror.derendering.angle_sum_quiet import check_angle_sum_quietly
 from wallmirror.derendering.calibration import Calibration
 from wallmirror.derendering.counting import solve_counts, with_counting_noise
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.exact import solve_exactly
 from wallmirror.derendering.facet_fit import WallModel, settle_wall
-from wallmirror.derendering.facets import Factor
 from wallmirror.derendering.knots import NOISY_STEPS
 from wallmirror.derendering.noisy import solve_noisy
 from wallmirror.derendering.one_bounce import check_one_bounce
@@ -177,14 +176,8 @@ def solve(
                 tell=tell,
             )
 
-        def closed(problem: Problem) -> Estimate:
-            found = solve_exactly(problem, space, step_deg=step_deg)
-            if problem.exponents and found.closed.near_solutions > 1:
-                raise UndeterminedError("several BRDFs of a wall of facets explain the captures equally well")
-            return found
-
-        def quietly(problem: Problem, estimate: Estimate, factors: tuple[Factor, ...]) -> AngleSumCheck:
-            return check_angle_sum_quietly(problem, space, estimate, factors)
+        closed = partial(solve_exactly, space=space, step_deg=step_deg)
+        quietly = partial(check_angle_sum_quietly, space=space)
 
         def foretold(problem: Problem, estimate: Estimate) -> float:
             further = check_one_bounce(problem, estimate, wall_albedo=wall_albedo)
