@@ -15,7 +15,7 @@ from wallmirror.derendering.angle_sum_check import AngleSumCheck, in_words
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.facets import EVERY, FITTED, Factor
 from wallmirror.derendering.problem import Problem
-from wallmirror.errors import UndeterminedError
+from wallmirror.errors import InputError, UndeterminedError
 
 WallModel = Literal["auto", "angle_sum", "microfacet"]
 #: Finds r and V at the exponents that a problem assumes.
@@ -68,7 +68,10 @@ def settle_wall(
     if wall == "auto" and found.rejects(bars) and foretold(problem, estimate) < _EXCUSED * found.bias:
         try:
             return fit_facets(problem, found, fit, check, tell)
-        except UndeterminedError as refusal:
+        except (
+            UndeterminedError,
+            InputError,
+        ) as refusal:  # nothing determines them, or the memory does not hold their knots
             tell(f"no wall of facets: {refusal}")
     return problem, estimate, found
 
