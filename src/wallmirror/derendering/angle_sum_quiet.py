@@ -57,18 +57,25 @@ def check_angle_sum_quietly(
     here = estimate.closed
     power = float(np.sum(here.source**2))
     missed = _missed(here, designs, space)
-    changes, turns = [], []
+    changes, bends, turns = [], [], []
     for factor in factors:
-        other = _times(designs, np.exp(_logarithms(problem, factor)))
-        there = closed_form(problem.weighted_data, other, space)
-        changes.append(_missed(there, other, space) - missed)
+        values = np.exp(_logarithms(problem, factor))
+        there, outside = _at(problem, _times(designs, values), space)
+        if problem.exponents:
+            # Facets that were fitted leave so little that what is no line in the exponents counts.
+            opposite = _at(problem, _times(designs, 1 / values), space)[1]
+            changes.append((outside - opposite) / 2)
+            bends.append(float(np.sum(((outside + opposite) / 2 - missed) ** 2)))
+        else:
+            changes.append(outside - missed)
+            bends.append(0.0)
         source = there.source * (float(np.sum(there.source * here.source)) / float(np.sum(there.source**2)))
         turns.append(source - here.source)
     gram = np.array([[np.sum(a * b) for b in changes] for a in changes])
     slope = np.array([np.sum(a * missed) for a in changes])
     whole = float(np.sum(missed**2))
     assumed = np.array([problem.exponents.get(k, 0.0) for k in factors])
-    step, covariance, left = _exponents(gram, slope, whole, assumed)
+    step, covariance, left = _exponents(gram, slope, whole, np.array(bends), assumed)
     together = np.array([[np.sum(a * b) for b in turns] for a in turns]) / power
     tested = len(factors) - len(problem.exponents)
     share = min(1.0, left / (whole + _ROUNDING))
@@ -83,8 +90,11 @@ def check_angle_sum_quietly(
     )
 
 
-def _exponents(gram: Array, slope: Array, whole: float, assumed: Array) -> tuple[Array, Array, float]:
-    """The step from the assumed exponents to the most likely ones, its covariance, and the mismatch that it leaves."""
+def _exponents(gram: Array, slope: Array, whole: float, bends: Array, assumed: Array) -> tuple[Array, Array, float]:
+    """The step from the assumed exponents to the most likely ones, its covariance, and the mismatch that it leaves.
+
+    What the lines miss of the mismatch over one standard deviation of the exponents is not known to be gone.
+    """
 
     def after(step: Array) -> float:
         return max(0.0, whole + 2 * float(slope @ step) + float(step @ gram @ step)) + _ROUNDING
@@ -93,10 +103,16 @@ def _exponents(gram: Array, slope: Array, whole: float, assumed: Array) -> tuple
     for _ in range(_ROUNDS):
         covariance = np.linalg.inv(gram / left + np.eye(assumed.size) / PRIOR_STD**2)
         step = -covariance @ (slope / left + assumed / PRIOR_STD**2)
-        before, left = left, after(step)
+        before, left = left, after(step) + float(bends @ np.diag(covariance) ** 2)
         if abs(left - before) < 1e-3 * left:
             break
     return np.asarray(step, dtype=np.float64), np.asarray(covariance, dtype=np.float64), left
+
+
+def _at(problem: Problem, designs: list[sp.csr_array], space: SignalSpace) -> tuple[ClosedForm, Array]:
+    """The closed form of another wall, and what it leaves outside the data's space."""
+    there = closed_form(problem.weighted_data, designs, space)
+    return there, _missed(there, designs, space)
 
 
 def _missed(closed: ClosedForm, designs: list[sp.csr_array], space: SignalSpace) -> Array:
