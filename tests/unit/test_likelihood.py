@@ -176,9 +176,8 @@ def dense_information(truth: Truth, weights: Array) -> Array:
 def test_the_schur_complement_is_the_information_without_v(weighted: bool) -> None:
     truth = small()
     weights = uneven(truth.data.shape) if weighted else np.ones(truth.data.shape)
-    schur, inverse, coupled = information(
-        moments(truth.data, list(truth.designs), weights if weighted else None), truth.r, truth.v
-    )
+    known = information(moments(truth.data, list(truth.designs), weights if weighted else None), truth.r, truth.v)
+    schur, inverse, coupled = known.schur, known.inverse, known.coupled
     whole = dense_information(truth, weights)
     k = truth.r.size
     assert schur.shape == (k, k)
@@ -196,14 +195,14 @@ def test_the_schur_complement_is_the_information_without_v(weighted: bool) -> No
 
 def test_the_null_vector_of_the_information_is_the_scale() -> None:
     truth = small()
-    schur, _, _ = information(moments(truth.data, list(truth.designs)), truth.r, truth.v)
+    schur = information(moments(truth.data, list(truth.designs)), truth.r, truth.v).schur
     values, vectors = np.linalg.eigh(schur)
     assert abs(values[0]) < 1e-12 * values[-1]
     assert values[1] > 1e-7 * values[-1]  # and it is the only one
     assert up_to_scale(vectors[:, 0], truth.r) < 1e-6
     # The twin: at an r that is not the truth's scale, it is that r.
     bent = truth.r * np.linspace(0.5, 2, truth.r.size)
-    schur, _, _ = information(moments(truth.data, list(truth.designs)), bent, truth.v)
+    schur = information(moments(truth.data, list(truth.designs)), bent, truth.v).schur
     assert np.max(np.abs(schur @ bent)) < 1e-11 * np.max(np.abs(schur)) * np.max(bent)
     assert np.max(np.abs(schur @ truth.r)) > 1e-4 * np.max(np.abs(schur))
 

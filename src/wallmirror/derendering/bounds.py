@@ -19,7 +19,7 @@ import scipy.linalg as sl
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from wallmirror.derendering.likelihood import Moments, information
+from wallmirror.derendering.likelihood import Information, Moments, information
 from wallmirror.derendering.splines import SplineGrid
 
 Array = NDArray[np.float64]
@@ -74,16 +74,12 @@ def cramer_rao(data: Moments, coefficients: Array, source: Array, *, gauge: Arra
     gauge:
         c, shape (K,): the values of the basis functions at the peak of rho.
     """
-    schur, inverse, coupled = information(data, coefficients, source)
-    return bound_of(schur, inverse, coupled, seen=data.seen, coefficients=coefficients, source=source, gauge=gauge)
+    return bound_of(information(data, coefficients, source), coefficients=coefficients, source=source, gauge=gauge)
 
 
 def bound_of(
-    schur: Array,
-    inverse: Array,
-    coupled: Array,
+    known: Information,
     *,
-    seen: NDArray[np.bool_],
     coefficients: Array,
     source: Array,
     gauge: Array,
@@ -92,13 +88,12 @@ def bound_of(
 
     Parameters
     ----------
-    schur, inverse, coupled:
-        S over the seen coefficients (K', K'), H_b^-1 (B, M, M) and H_b^-1 C_b (B, M, K').
-    seen:
-        Which of the K coefficients those are, shape (K,).
+    known:
+        The information at (r, V).
     coefficients, source, gauge:
         As for `cramer_rao`.
     """
+    schur, inverse, coupled, seen = known.schur, known.inverse, known.coupled, known.seen
     c, r = gauge[seen], coefficients[seen]
     strength = float(np.trace(schur)) / max(1, schur.shape[0]) / max(float(c @ c), 1e-300)
     pinned = schur + strength * np.outer(c, c)

@@ -112,4 +112,5 @@ def solve_counts(
         predicted_error=sigma * bound.source_error,
         chi_squared=fit.chi_squared,
         warnings=tuple(warnings),
+        designs=designs,
     )

@@ -6,8 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from wallmirror.derendering.likelihood import Information
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm
 
@@ -39,6 +41,10 @@ class Estimate:
         What the answer rests on beside the captures, in words.
     groups:
         Elements that share a scale, each ascending, where there is more than the one global scale.
+    designs:
+        T_1 .. T_M over the grid, each sparse (P, K), where the method made them.
+    information:
+        The Fisher information at r and V with the problem's weights, where the method needed it.
     """
 
     method: str
@@ -56,6 +62,8 @@ class Estimate:
     warnings: tuple[str, ...]
     priors: tuple[str, ...] = ()
     groups: tuple[tuple[int, ...], ...] = ()
+    designs: list[sp.csr_array] | None = None
+    information: Information | None = None
 
 
 def doubts_of_fit(*, converged: bool, misfit: float | None) -> list[str]:

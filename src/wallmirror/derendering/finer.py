@@ -1,4 +1,4 @@
-"""What finer knots would gain, told from the fit on coarser ones: the score test, without a fit of its own.
+"""What finer knots would gain and coarser ones lose, told from a fit without another one: the tests of Rao and Wald.
 
 At the maximum of the likelihood on some knots the gradient g on knots twice as fine vanishes along the coarser splines.
 Were these enough, g^T S^-1 g would be noise, as large as the number of coefficients that are new (Rao, Proc. Cambridge
@@ -7,7 +7,8 @@ that number from below in a dozen products S x, each of which goes through the p
 
     S x = sum_i T_i^T sum_b W_b (1 - F H_b^-1 F^T W_b) (sum_j V_jb T_j x) V_ib,
 
-so that neither S nor the moments of the finer knots are formed.
+so that neither S nor the moments of the finer knots are formed. The other way round the fit has S, and what is lost by the
+nearest r among the coarser splines, d^T S d, tells whether those can do at all (Wald, Trans. Amer. Math. Soc. 54(3), 1943).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import scipy.linalg as sl
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from wallmirror.derendering.convex import solve_positive
 from wallmirror.derendering.moments import LEAST_SEEN
 
 Array = NDArray[np.float64]
@@ -151,6 +153,25 @@ def score(films: Films, designs: list[sp.csr_array], band: Array, free: NDArray[
         if gain >= enough or length * now < _SETTLED * gain:
             break
     return Finer(gain, x, int(np.count_nonzero(moving)))
+
+
+def loss(schur: Array, r: Array, pull: Array, prolongation: sp.csr_array) -> float:
+    """The rise of the misfit that coarser knots make, as far as it is quadratic and not all of the films.
+
+    Parameters
+    ----------
+    schur, r, pull:
+        S at a fit (K, K), whose null vector is r, the global scale; its coefficients (K,); and sum_b J_b^T W d_b (K,).
+    prolongation:
+        R of shape (K, K'): coefficients r' on the coarser knots are R r'.
+    """
+    # The films that r' makes along those of r: held, since at the scale 0 nothing would be missed.
+    pinned = schur + np.outer(pull, pull) / max(float(pull @ r), 1e-300)
+    half = prolongation.T @ pinned
+    coarse = half @ prolongation
+    coarse[np.diag_indices_from(coarse)] += _RIDGE * np.trace(coarse) / coarse.shape[0]
+    missed = r - prolongation @ solve_positive(coarse, half @ r)
+    return float(missed @ pinned @ missed)
 
 
 def worth(added: int, freedom: int) -> float:

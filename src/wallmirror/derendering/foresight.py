@@ -124,7 +124,7 @@ def foresee(
         along = gram @ coefficients[seen]
         power = float(along @ coefficients[seen])
         spilt = float(np.sum(gram * bound.coefficients)) - float(along @ bound.coefficients @ along) / power
-        _, normal, _ = information(summed, coefficients, source)
+        normal = information(summed, coefficients, source).inverse
         known = math.sqrt(float(np.einsum("bii->", normal)) / float(np.sum(source**2)))
     transport_error = ratio * math.sqrt(max(0.0, spilt) / power)
     return Forecast(

@@ -15,11 +15,11 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from wallmirror.derendering.bounds import Bound, cramer_rao
+from wallmirror.derendering.bounds import Bound, bound_of
 from wallmirror.derendering.estimate import scale_free_error
-from wallmirror.derendering.finer import Films, Finer, score, worth
+from wallmirror.derendering.finer import Films, Finer, loss, score, worth
 from wallmirror.derendering.ladder import ROUGH, Ladder
-from wallmirror.derendering.likelihood import Fit, maximise
+from wallmirror.derendering.likelihood import Fit, Information, information, maximise
 from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.problem import Problem, expected_mismatch, too_few_patterns
 from wallmirror.derendering.splines import SplineGrid
@@ -38,6 +38,8 @@ _SETTLED = 0.25
 _FAR_OFF = 2.0
 _GAP = 1.0
 _START = 0.3
+# So many times more than noise explains must coarser knots lose by a quadratic guess for no fit to be tried on them.
+_HOPELESS = 10.0
 # Share of the data that finer knots must leave over.
 _SPARE = 0.25
 # Share of the BRDF's largest coefficient above which one is lit, of the best-seen one's information above which that one
@@ -75,13 +77,22 @@ class Level:
         return self.grid.peak(self.fit.coefficients, self.summed.exposure)
 
     @cached_property
+    def information(self) -> Information:
+        """The Fisher information at the fit, in units of the weights."""
+        return information(self.summed, self.fit.coefficients, self.fit.source)
+
+    @cached_property
     def bound(self) -> Bound:
         """The Cramer-Rao bound at the fit, for noise of unit variance in units of the weights."""
-        return self.bound_at(self.fit.source)
+        return self._bound(self.information, self.fit.source)
 
     def bound_at(self, source: Array) -> Bound:
         """The bound at the fit's rho and another V, shape (M, B)."""
-        return cramer_rao(self.summed, self.fit.coefficients, source, gauge=self.grid.row(self.peak_at))
+        return self._bound(information(self.summed, self.fit.coefficients, source), source)
+
+    def _bound(self, known: Information, source: Array) -> Bound:
+        gauge = self.grid.row(self.peak_at)
+        return bound_of(known, coefficients=self.fit.coefficients, source=source, gauge=gauge)
 
 
 @dataclass(frozen=True)
@@ -199,7 +210,7 @@ def _climb(
     index = begin
     best = fit(index, ladder.closed(index).coefficients)
     rival: Other | None = None
-    while index > 0:  # coarser ones may do
+    while index > 0 and not _needed(ladder, index, best, tell):  # coarser ones may do
         coarser = fit(index - 1, ladder.coarsened(index, best.coefficients))
         freedom = ladder.freedom(index)
         fewer = ladder.seen(index) - ladder.seen(index - 1)
@@ -232,6 +243,19 @@ def _climb(
         if idle == 2 or not ladder.problem.noise_is_stated or _at_the_noise(ladder, index, best):
             break
     return fits, rival
+
+
+def _needed(ladder: Ladder, index: int, fit: Fit, tell: Tell) -> bool:
+    """Whether coarser knots than a fit's would miss so much more than noise does that no fit on them is called for."""
+    summed, halved = ladder.summed(index), ladder.grids[index - 1].in_halved()
+    schur = information(summed, fit.coefficients, fit.source).schur
+    pull = np.einsum("ib,bik->k", fit.source, summed.cross)[summed.seen]
+    lost = loss(schur, fit.coefficients[summed.seen], pull, sp.csr_array(halved[summed.seen]))
+    freedom = ladder.freedom(index)
+    if lost < _HOPELESS * worth(ladder.seen(index), freedom) * ladder.variance(fit.objective, freedom):
+        return False
+    tell(f"knots every {math.degrees(ladder.grids[index - 1].step):g} deg would raise it by about {lost:.4g}")
+    return True
 
 
 def _at_the_noise(ladder: Ladder, index: int, fit: Fit) -> bool:

@@ -1,7 +1,6 @@
 """Nested spline grids for the BRDF of one problem, with what a fit needs of the data on each, made when first asked for.
 
-Every grid halves the knot spacing of the one before, so that the splines of each lie among those of the next, and what a
-fit needs of the data on coarse knots follows from what it needs on finer ones without another pass over the pixels.
+Every grid halves the knot spacing of the one before, so that the splines of each lie among those of the next.
 """
 
 from __future__ import annotations
@@ -20,6 +19,8 @@ from wallmirror.derendering.moments import Moments, moments
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import SplineGrid, design_matrices
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, banded_gram, closed_form
+
+from wallmirror.transport import Kernel
 
 Array = NDArray[np.float64]
 
@@ -45,6 +46,7 @@ class Ladder:
     space: SignalSpace
     grids: tuple[SplineGrid, ...]
     quadrature: float
+    _kernels: dict[int, Kernel] = field(default_factory=dict)
     _designs: dict[int, list[sp.csr_array]] = field(default_factory=dict)
     _summed: dict[int, Moments] = field(default_factory=dict)
     _bands: dict[int, Array] = field(default_factory=dict)
@@ -56,7 +58,8 @@ class Ladder:
     def of(cls, problem: Problem, space: SignalSpace, steps: tuple[float, ...], tolerance: float | None) -> Ladder:
         """Over the angle sums of a problem; one spacing in degrees, or several, each half of the one before."""
         quadrature = _quadrature(problem, tolerance)
-        u = problem.kernel(steps[-1], quadrature).angle_sum
+        finest = problem.kernel(steps[-1], quadrature)
+        u = finest.angle_sum
         room = math.radians(steps[-1]) if len(steps) > 1 else 0.0  # other quadratures reach a little further
         grids = [
             SplineGrid.covering(
@@ -65,7 +68,7 @@ class Ladder:
         ]
         for _ in steps[1:]:
             grids.append(grids[-1].halved())
-        return cls(problem, space, tuple(grids), quadrature)
+        return cls(problem, space, tuple(grids), quadrature, {len(steps) - 1: finest})
 
     @property
     def last(self) -> int:
@@ -75,19 +78,17 @@ class Ladder:
     def designs(self, index: int) -> list[sp.csr_array]:
         """T_1 .. T_M, each sparse (P, K)."""
         if index not in self._designs:
-            grid = self.grids[index]
-            kernel = self.problem.kernel(math.degrees(grid.step), self.quadrature)
-            self._designs[index] = design_matrices(kernel, grid)
+            # One quadrature for all knots but the finest, so that their misfits differ for the knots' sake alone.
+            finer = max(index, self.last - 1)
+            if finer not in self._kernels:
+                self._kernels[finer] = self.problem.kernel(math.degrees(self.grids[finer].step), self.quadrature)
+            self._designs[index] = design_matrices(self._kernels[finer], self.grids[index])
         return self._designs[index]
 
     def summed(self, index: int) -> Moments:
-        """Of the two finest from the pixels, of the others from the next finer one."""
+        """What the likelihood needs of the data."""
         if index not in self._summed:
-            if index < self.last - 1:
-                made = self.summed(index + 1).coarsened(self.grids[index].in_halved())
-            else:
-                made = moments(self.problem.data, self.designs(index), self.problem.inverse_variance)
-            self._summed[index] = made
+            self._summed[index] = moments(self.problem.data, self.designs(index), self.problem.inverse_variance)
         return self._summed[index]
 
     def closed(self, index: int) -> ClosedForm:
@@ -101,7 +102,11 @@ class Ladder:
     def band(self, index: int) -> Array:
         """Lower band of sum_i T_i^T W T_i."""
         if index not in self._bands:
-            self._bands[index] = banded_gram(self.problem.weighted(self.designs(index)))
+            alike = self.problem.fit_weights.shape[1] == 1
+            if alike and index < self.last:  # whose moments a fit asks for as well
+                self._bands[index] = self.summed(index).pairs[0].band
+            else:
+                self._bands[index] = banded_gram(self.problem.weighted(self.designs(index)))
         return self._bands[index]
 
     def bounded(self, index: int, free: Fit) -> Fit:

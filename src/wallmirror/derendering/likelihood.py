@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from wallmirror.derendering.convex import minimise_above, solve_positive
 from wallmirror.derendering.moments import Moments, moments
 
-__all__ = ["Fit", "Moments", "best_nonnegative", "information", "maximise", "moments"]
+__all__ = ["Fit", "Information", "Moments", "best_nonnegative", "information", "maximise", "moments"]
 
 Array = NDArray[np.float64]
 
@@ -54,6 +54,26 @@ class Fit:
     objective: float
     iterations: int
     converged: bool
+
+
+@dataclass(frozen=True)
+class Information:
+    """Fisher information at a point of the likelihood, in units of the weights.
+
+    Parameters
+    ----------
+    schur:
+        S over the K' seen coefficients, (K', K').
+    inverse, coupled:
+        H_b^-1 (B, M, M) and H_b^-1 C_b (B, M, K').
+    seen:
+        Which of the K coefficients those are, shape (K,).
+    """
+
+    schur: Array
+    inverse: Array
+    coupled: Array
+    seen: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -104,17 +124,12 @@ def maximise(
     return _fit(state, max_iterations, converged=False)
 
 
-def information(data: Moments, coefficients: Array, source: Array) -> tuple[Array, Array, Array]:
-    """Fisher information in units of the weights: S over the seen cells, H_b^-1 and H_b^-1 C_b.
-
-    Returns
-    -------
-    S of shape (K', K') for the K' seen coefficients, H_b^-1 (B, M, M), H_b^-1 C_b (B, M, K').
-    """
+def information(data: Moments, coefficients: Array, source: Array) -> Information:
+    """The Fisher information at r (K,) and V (M, B)."""
     seen = data.seen
     state = _evaluate(data, coefficients, source.T, nonnegative=True)
     gram, inverse, coupled = _schur(data, state, np.ones_like(state.v, dtype=bool), np.flatnonzero(seen))
-    return gram, inverse, coupled
+    return Information(gram, inverse, coupled, seen)
 
 
 def best_nonnegative(data: Moments, source: Array) -> Array:

@@ -9,7 +9,7 @@ so that an iteration of a fit does not touch the pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -35,13 +35,10 @@ class Pairs:
         is the transpose.
     elements:
         M.
-    prolongation:
-        R of shape (K, K') where the coefficients are r = R r' of coarser knots: R^T N_ij R is never formed. None for r.
     """
 
     above: sp.csr_array
     elements: int
-    prolongation: sp.csr_array | None = None
 
     @classmethod
     def of(cls, designs: list[sp.csr_array], windows: Windows | None, weight: Array) -> Pairs:
@@ -58,57 +55,50 @@ class Pairs:
 
     @property
     def size(self) -> int:
-        """K, of the coefficients that are asked for."""
-        return self._finest if self.prolongation is None else int(self.prolongation.shape[1])
-
-    @property
-    def _finest(self) -> int:
+        """K."""
         return int(self.above.shape[0]) // (self.elements * (self.elements + 1) // 2)
 
     @cached_property
     def _where(self) -> NDArray[np.int64]:
         """Place of each entry in a flat (K, K)."""
-        size = self._finest
+        size = self.size
         row = np.tile(np.arange(0, size * size, size), self.above.shape[0] // size)
         return np.asarray(np.repeat(row, np.diff(self.above.indptr)) + self.above.indices % size)
 
     @cached_property
     def _counts(self) -> NDArray[np.int64]:
         """Entries of each pair."""
-        return np.asarray(np.diff(self.above.indptr[:: self._finest]))
+        return np.asarray(np.diff(self.above.indptr[:: self.size]))
 
     @cached_property
-    def diagonal(self) -> Array:
-        """Diagonal of sum_i N_ii, shape (K,)."""
-        return np.asarray(np.diag(self.mixed(np.eye(self.elements))))
+    def band(self) -> Array:
+        """Lower band of sum_i N_ii, shape (w, K): entry [d, k] is that of row k + d and column k."""
+        size = self.size
+        pointers = self.above.indptr.astype(np.intp)
+        first = [i * self.elements - i * (i - 1) // 2 for i in range(self.elements)]  # (i, i) among the pairs
+        inside = np.concatenate([np.arange(pointers[k * size], pointers[(k + 1) * size]) for k in first])
+        row, column = np.divmod(self._where[inside], size)
+        below = row >= column
+        place = (row - column)[below] * size + column[below]
+        width = int(np.max(row - column, initial=0)) + 1
+        sums = np.bincount(place, weights=self.above.data[inside[below]], minlength=width * size)
+        return np.asarray(sums.reshape(width, size), dtype=np.float64)
 
     def times(self, r: Array) -> Array:
         """N_ij r, shape (M, M, K)."""
-        if self.prolongation is not None:
-            r = self.prolongation @ r
         i, j = np.triu_indices(self.elements)
         every = np.tile(r, i.size)
         products = np.empty((self.elements, self.elements, r.size))
         products[i, j] = (self.above @ every).reshape(i.size, -1)
         products[j, i] = (self.above.T @ every).reshape(i.size, -1)
-        if self.prolongation is None:
-            return products
-        coarse = products.reshape(-1, r.size) @ self.prolongation
-        return np.asarray(coarse.reshape(self.elements, self.elements, -1))
-
-    def coarsened(self, prolongation: sp.csr_array) -> Pairs:
-        """R^T N_ij R: the same of coefficients that are R times coarser ones, R of shape (K, K')."""
-        whole = prolongation if self.prolongation is None else sp.csr_array(self.prolongation @ prolongation)
-        return replace(self, prolongation=whole)
+        return products
 
     def mixed(self, products: Array) -> Array:
         """sum_ij products_ij N_ij for symmetric products (M, M), dense (K, K)."""
-        size = self._finest
+        size = self.size
         factors = (products - 0.5 * np.diag(np.diag(products)))[np.triu_indices(self.elements)]
         weights = self.above.data * np.repeat(factors, self._counts)
         square = np.bincount(self._where, weights=weights, minlength=size * size).reshape(size, size)
-        if self.prolongation is not None:
-            square = self.prolongation.T @ square @ self.prolongation
         return np.asarray(square + square.T, dtype=np.float64)
 
 
@@ -149,7 +139,7 @@ class Moments:
     @cached_property
     def exposure(self) -> Array:
         """How well each coefficient is seen, relative to the best-seen one, shape (K,)."""
-        total = np.sum([pairs.diagonal for pairs in self.pairs], axis=0)
+        total = np.sum([pairs.band[0] for pairs in self.pairs], axis=0)
         return np.asarray(total / max(float(total.max(initial=0.0)), 1e-300))
 
     @property
@@ -164,12 +154,6 @@ class Moments:
             rows = v[self.group == g]
             total += pairs.mixed(rows.T @ rows)
         return total
-
-    def coarsened(self, prolongation: sp.csr_array) -> Moments:
-        """The moments of coefficients r' with r = R r', for R of shape (K, K'): no pass over the data is needed."""
-        realisations, elements, size = self.cross.shape
-        cross = (self.cross.reshape(-1, size) @ prolongation).reshape(realisations, elements, -1)
-        return replace(self, pairs=[pairs.coarsened(prolongation) for pairs in self.pairs], cross=cross)
 
 
 def moments(data: Array, designs: list[sp.csr_array], inverse_variance: Array | None = None) -> Moments:

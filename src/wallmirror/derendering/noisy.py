@@ -95,6 +95,8 @@ def solve_noisy(
         predicted_error=predicted,
         chi_squared=reduced if stated else math.nan,
         warnings=tuple(warnings),
+        designs=level.designs,
+        information=level.information,
     )
 
 

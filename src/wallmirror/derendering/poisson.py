@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wallmirror.derendering.bounds import Bound, bound_of
 from wallmirror.derendering.convex import minimise_above, solve_positive
+from wallmirror.derendering.likelihood import Information
 from wallmirror.derendering.poisson_information import Products, information_of_counts, seen_cells, transport_of
 from wallmirror.errors import InputError
 
@@ -194,7 +195,8 @@ def poisson_bound(
     schur, inverse, coupled = information_of_counts(
         Products(designs), coefficients, source, weights, np.flatnonzero(seen), free
     )
-    return bound_of(schur, inverse, coupled, seen=seen, coefficients=coefficients, source=source, gauge=gauge)
+    known = Information(schur, inverse, coupled, seen)
+    return bound_of(known, coefficients=coefficients, source=source, gauge=gauge)
 
 
 def _checked(
