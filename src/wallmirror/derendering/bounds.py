@@ -24,6 +24,9 @@ from wallmirror.derendering.splines import SplineGrid
 
 Array = NDArray[np.float64]
 
+# Share of a bound on V that a ten times larger ridge must leave.
+_KEPT = 0.8
+
 
 @dataclass(frozen=True)
 class Bound:
@@ -120,10 +123,13 @@ def bound_of(
     covariance = _inverse(lower) - np.outer(scale, scale)
     spread = (rows @ covariance).reshape(coupled.shape)
     error = _scale_free_error(source, inverse, coupled, spread)
-    # What the ridge alone holds, nothing holds: a bound on V that falls with it is none.
-    if sound:
+    # What the ridge alone holds, nothing holds: a bound on V that falls with it is none. It is convex in the ridge, so that
+    # its slope tells how far it may fall at most.
+    whole = spread.reshape(rows.shape) + np.outer(rows @ scale, scale)  # [H^-1 C] of the pinned information's inverse
+    most = 9 * ridge * float(np.sum(whole * whole)) / max(float(np.sum(source * source)), 1e-300)
+    if sound and not error**2 - most >= (_KEPT * error) ** 2:
         solved = sl.cho_solve((factor(10 * ridge), True), rows.T, check_finite=False).T - np.outer(rows @ scale, scale)
-        sound = _scale_free_error(source, inverse, coupled, solved.reshape(coupled.shape)) >= 0.8 * error
+        sound = _scale_free_error(source, inverse, coupled, solved.reshape(coupled.shape)) >= _KEPT * error
     if not sound:
         error = float("inf")
     variance = np.einsum("bii->bi", inverse) + np.sum(spread * coupled, axis=-1)

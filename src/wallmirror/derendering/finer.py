@@ -75,6 +75,9 @@ class Films:
     def normal(self) -> Array:
         """H_b, shape (B, M, M), or (1, M, M) for weights of all realisations alike."""
         rows, elements = self.transport.shape
+        if self.weights.shape[1] == 1:
+            normal = (self.transport.T @ (self.weights * self.transport))[None]
+            return np.asarray(normal + 1e-14 * np.trace(normal[0]) * np.eye(elements))
         squares = (self.transport[:, :, None] * self.transport[:, None, :]).reshape(rows, -1)
         normal = (self.weights.T @ squares).reshape(-1, elements, elements)
         normal += 1e-14 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(elements)
@@ -83,6 +86,8 @@ class Films:
     def solved(self, films: Array) -> Array:
         """H_b^-1 F^T W_b of each column, shape (M, B): the V that explains the films best."""
         right = self.transport.T @ (self.weights * films)
+        if self.weights.shape[1] == 1:
+            return np.asarray(np.linalg.solve(self.normal[0], right))
         return np.asarray(np.linalg.solve(self.normal, right.T[..., None])[..., 0].T)
 
     def unexplained(self, films: Array) -> Array:
@@ -122,15 +127,14 @@ def score(films: Films, designs: list[sp.csr_array], band: Array, free: NDArray[
     band[0] += _RIDGE * float(band[0].max())
     factor = sl.cholesky_banded(band, lower=True, check_finite=False)
 
-    tall = sp.csr_array(sp.vstack(designs, format="csr"))
-    wide = tall.T
-    elements = len(designs)
+    transposed = [t.T for t in designs]
 
     def back(weighted: Array) -> Array:
-        return np.where(moving, wide @ (weighted @ v.T).T.ravel(), 0.0)
+        along = v @ weighted.T
+        return np.where(moving, sum(t @ row for t, row in zip(transposed, along, strict=True)), 0.0)
 
     def apply(x: Array) -> Array:
-        return back(films.unexplained((tall @ x).reshape(elements, -1).T @ v))
+        return back(films.unexplained(np.stack([t @ x for t in designs]).T @ v))
 
     x = np.zeros(designs[0].shape[1])
     residual = back(films.unexplained(films.data))

@@ -79,7 +79,7 @@ class Level:
     @cached_property
     def information(self) -> Information:
         """The Fisher information at the fit, in units of the weights."""
-        return information(self.summed, self.fit.coefficients, self.fit.source)
+        return information(self.summed, self.fit.coefficients, self.fit.source, self.fit.schur)
 
     @cached_property
     def bound(self) -> Bound:
@@ -248,7 +248,7 @@ def _climb(
 def _needed(ladder: Ladder, index: int, fit: Fit, tell: Tell) -> bool:
     """Whether coarser knots than a fit's would miss so much more than noise does that no fit on them is called for."""
     summed, halved = ladder.summed(index), ladder.grids[index - 1].in_halved()
-    schur = information(summed, fit.coefficients, fit.source).schur
+    schur = information(summed, fit.coefficients, fit.source, fit.schur).schur
     pull = np.einsum("ib,bik->k", fit.source, summed.cross)[summed.seen]
     lost = loss(schur, fit.coefficients[summed.seen], pull, sp.csr_array(halved[summed.seen]))
     freedom = ladder.freedom(index)

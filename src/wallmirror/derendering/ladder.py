@@ -25,7 +25,7 @@ from wallmirror.transport import Kernel
 Array = NDArray[np.float64]
 
 #: Between knots the fits need not be finer than this share of the misfit.
-ROUGH = 1e-6
+ROUGH = 1e-5
 # That of the closed form: splines of degree 3 need knots half as far apart for lobes of the same width.
 _DEGREE = 7
 # Quadrature of the fit, of a lobe's peak.

@@ -17,9 +17,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg as sl
 from numpy.typing import NDArray
 
-from wallmirror.derendering.convex import minimise_above, solve_positive
+from wallmirror.derendering.convex import minimise_above, positive_factor
 from wallmirror.derendering.moments import Moments, moments
 
 __all__ = ["Fit", "Information", "Moments", "best_nonnegative", "information", "maximise", "moments"]
@@ -29,6 +30,8 @@ Array = NDArray[np.float64]
 # Cells seen less than this relative to the best-seen one are weak: noise rules them in a start.
 _WEAK = 1e-4
 _RIDGE = 1e-12
+# S is made anew where a step with that of the point before promises more than this share of what the last one did.
+_QUICK = 0.1
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,8 @@ class Fit:
         Newton steps taken.
     converged:
         Whether the last step was below the tolerance.
+    schur:
+        S at the maximum or a step before it that changed next to nothing, over the seen coefficients, where it is at hand.
     """
 
     coefficients: Array
@@ -54,6 +59,7 @@ class Fit:
     objective: float
     iterations: int
     converged: bool
+    schur: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -81,8 +87,34 @@ class _State:
     r: Array
     v: Array  # (B, M)
     normal: Array  # H, (G, M, M)
+    moment: Array  # F^T W d_b, (B, M)
     pair: Array  # N_ij r, (G, M, M, K)
     objective: float
+
+
+@dataclass(frozen=True)
+class _Curvature:
+    """What a Gauss-Newton step takes from the point where it starts, or from one nearby.
+
+    Parameters
+    ----------
+    free:
+        Entries of V that may move, (B, M).
+    inverse:
+        H_b^-1, (B, M, M).
+    schur:
+        S over the seen coefficients.
+    pinned:
+        S with the gauge; None where nothing depends on r.
+    factor:
+        The Cholesky factor of that, as `positive_factor` makes it, where r has no bounds.
+    """
+
+    free: NDArray[np.bool_]
+    inverse: Array
+    schur: Array
+    pinned: Array | None
+    factor: Array | None
 
 
 def maximise(
@@ -108,10 +140,15 @@ def maximise(
     states = (_evaluate(data, r, None, nonnegative=nonnegative) for r in begins)
     state = min(states, key=lambda candidate: candidate.objective)
     rounding = 1e-14 * float(np.sum(data.energy))
+    curvature: _Curvature | None = None
+    slope = 0.0
     for iteration in range(1, max_iterations + 1):
-        dr, slope = _step(data, state, seen, nonnegative=nonnegative)
-        if slope <= tolerance * state.objective + rounding:
-            return _fit(state, iteration, converged=True)
+        enough = tolerance * state.objective + rounding
+        dr, slope, curvature = _step(data, state, seen, curvature, (enough, _QUICK * slope), nonnegative=nonnegative)
+        if slope <= enough:  # that step as well, since it is made
+            trial = _evaluate(data, state.r + dr, None, nonnegative=nonnegative)
+            state = trial if trial.objective <= state.objective else state
+            return _fit(state, iteration, converged=True, curvature=curvature)
         length = 1.0
         while True:
             trial = _evaluate(data, state.r + length * dr, None, nonnegative=nonnegative)
@@ -124,12 +161,16 @@ def maximise(
     return _fit(state, max_iterations, converged=False)
 
 
-def information(data: Moments, coefficients: Array, source: Array) -> Information:
-    """The Fisher information at r (K,) and V (M, B)."""
+def information(data: Moments, coefficients: Array, source: Array, schur: Array | None = None) -> Information:
+    """The Fisher information at r (K,) and V (M, B); S where a fit has made it already."""
     seen = data.seen
     state = _evaluate(data, coefficients, source.T, nonnegative=True)
-    gram, inverse, coupled = _schur(data, state, np.ones_like(state.v, dtype=bool), np.flatnonzero(seen))
-    return Information(gram, inverse, coupled, seen)
+    free = np.ones_like(state.v, dtype=bool)
+    inverse = _inverse(data, state, free)
+    cells = np.flatnonzero(seen)
+    coupled = inverse @ _coupling(data, state)[..., cells]
+    schur = _schur(data, state, free, inverse, cells) if schur is None else schur
+    return Information(schur, inverse, coupled, seen)
 
 
 def best_nonnegative(data: Moments, source: Array) -> Array:
@@ -149,8 +190,10 @@ def _clipped(data: Moments, r: Array) -> Array:
     return np.clip(r, 0.0, np.where(weak, np.max(r[~weak], initial=0.0), np.inf))
 
 
-def _fit(state: _State, iterations: int, *, converged: bool) -> Fit:
-    return Fit(state.r, state.v.T.copy(), state.objective, iterations, converged)
+def _fit(state: _State, iterations: int, *, converged: bool, curvature: _Curvature | None = None) -> Fit:
+    # With entries of V at their bounds the curvature counts these as known, which the information does not.
+    schur = curvature.schur if curvature is not None and np.all(curvature.free) else None
+    return Fit(state.r, state.v.T.copy(), state.objective, iterations, converged, schur)
 
 
 def _evaluate(data: Moments, r: Array, v: Array | None, *, nonnegative: bool) -> _State:
@@ -168,68 +211,106 @@ def _evaluate(data: Moments, r: Array, v: Array | None, *, nonnegative: bool) ->
                 v[b] = minimise_above(np.zeros(m), quadratic_b, moment[b])
     quadratic = np.einsum("bi,bij,bj->b", v, normal[data.group], v)
     objective = float(np.sum(data.energy - 2 * np.sum(v * moment, axis=1) + quadratic))
-    return _State(r, v, normal, pair, objective)
+    return _State(r, v, normal, moment, pair, objective)
 
 
-def _step(data: Moments, state: _State, seen: NDArray[np.bool_], *, nonnegative: bool) -> tuple[Array, float]:
-    """The Gauss-Newton step in r with V eliminated, and the decrease of the objective that it promises."""
-    residual = data.cross - _modelled(data, state)  # T_i^T W e_b
-    grad_r = np.einsum("bi,bik->k", state.v, residual)
-    grad_v = residual @ state.r
-    free_v = np.ones_like(state.v, dtype=bool)
-    if nonnegative:
-        free_v = (state.v > 0) | (grad_v > 0)
+def _step(
+    data: Moments,
+    state: _State,
+    seen: NDArray[np.bool_],
+    last: _Curvature | None,
+    between: tuple[float, float],
+    *,
+    nonnegative: bool,
+) -> tuple[Array, float, _Curvature]:
+    """The Gauss-Newton step in r with V eliminated, the decrease of the objective that it promises, and its curvature.
+
+    Near the maximum the curvature hardly changes: the last step's does for promises `between` two values. Whether a promise
+    is so small that the climb is over, only the curvature of the place itself may say.
+    """
+    grad_v = state.moment - np.einsum("bij,bj->bi", state.normal[data.group], state.v)
+    grad_r = np.einsum("bi,bik->k", state.v, data.cross) - _mixed(data, state, state.v)
+    free = (state.v > 0) | (grad_v > 0) if nonnegative else np.ones_like(state.v, dtype=bool)
+    grad_v = np.where(free, grad_v, 0.0)
     cells = np.flatnonzero(seen)
-    grad_v = np.where(free_v, grad_v, 0.0)
-    schur, _, coupled = _schur(data, state, free_v, cells)
-    right = grad_r[cells] - np.einsum("bmk,bm->k", coupled, grad_v)
+
+    def along(curvature: _Curvature) -> tuple[Array, float, _Curvature]:
+        eliminated = np.einsum("bij,bj->bi", curvature.inverse, grad_v)
+        right = (grad_r - _mixed(data, state, eliminated))[cells]
+        dr = np.zeros_like(state.r)
+        if nonnegative and curvature.pinned is not None:
+            dr[cells] = minimise_above(-state.r[cells], curvature.pinned, right)
+        elif curvature.factor is not None:
+            dr[cells] = sl.cho_solve((curvature.factor, True), right, check_finite=False)
+        return dr, float(grad_r @ dr), curvature
+
+    if last is not None and np.array_equal(free, last.free):
+        found = along(last)
+        if between[0] < found[1] <= between[1]:
+            return found
+    return along(_curvature(data, state, free, cells, nonnegative=nonnegative))
+
+
+def _curvature(
+    data: Moments, state: _State, free: NDArray[np.bool_], cells: NDArray[np.intp], *, nonnegative: bool
+) -> _Curvature:
+    inverse = _inverse(data, state, free)
+    schur = _schur(data, state, free, inverse, cells)
     r = state.r[cells]
     level = np.trace(schur) / max(1, cells.size)
-    step = np.zeros(cells.size)
-    if level > 0:
-        # The gauge r r^T keeps the step off the scale's null direction; the ridge is for barely seen cells.
-        schur += level * np.outer(r, r) / max(float(r @ r), 1e-300)
-        schur[np.diag_indices_from(schur)] += _RIDGE * level
-        step = minimise_above(-r, schur, right) if nonnegative else solve_positive(schur, right)
-    dr = np.zeros_like(state.r)
-    dr[cells] = step
-    return dr, float(grad_r @ dr)
+    if not level > 0:
+        return _Curvature(free, inverse, schur, None, None)
+    # The gauge r r^T keeps the step off the scale's null direction; the ridge is for barely seen cells.
+    pinned = schur + level / max(float(r @ r), 1e-300) * np.outer(r, r)
+    pinned[np.diag_indices_from(pinned)] += _RIDGE * level
+    return _Curvature(free, inverse, schur, pinned, None if nonnegative else positive_factor(pinned))
 
 
-def _modelled(data: Moments, state: _State) -> Array:
-    """T_i^T W F v_b, shape (B, M, K)."""
-    b, m = state.v.shape
-    total = np.empty((b, m, data.size))
+def _mixed(data: Moments, state: _State, other: Array) -> Array:
+    """sum_b J_b^T W F u_b for a pattern u (B, M) beside v: by symmetry also sum_b C_b^T u_b; shape (K,)."""
+    total = np.zeros(data.size)
     for g, pair in enumerate(state.pair):
-        rows = np.flatnonzero(data.group == g)
-        # sum_j v_j (T_i^T W T_j r): one product of matrices a group.
-        product = state.v[rows] @ pair.transpose(1, 0, 2).reshape(m, -1)
-        total[rows] = product.reshape(rows.size, m, data.size)
+        rows = data.group == g
+        total += np.tensordot(state.v[rows].T @ other[rows], pair, axes=2)
     return total
 
 
-def _schur(
-    data: Moments, state: _State, free: NDArray[np.bool_], cells: NDArray[np.intp]
-) -> tuple[Array, Array, Array]:
-    """S on the given cells, and H_b^-1, H_b^-1 C_b with the rows of fixed source entries zero."""
+def _inverse(data: Moments, state: _State, free: NDArray[np.bool_]) -> Array:
+    """H_b^-1 with the rows and columns of fixed source entries zero, shape (B, M, M)."""
     m = data.elements
-    total = data.gram_of_source(state.v)
-    normal = state.normal[data.group].copy()
-    both = free[:, :, None] & free[:, None, :]
-    normal = np.where(both, normal, np.eye(m) * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-300)
-    ridge = 1e-14 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(m)
-    inverse = np.where(both, np.linalg.inv(normal + ridge), 0.0)
-    coupling = _coupling(data, state)[..., cells]
-    coupled = inverse @ coupling
-    schur = total if cells.size == data.size else total[np.ix_(cells, cells)]
-    if len(data.pairs) == 1 and np.all(free) and state.v.shape[0] > m:
-        # One H for all: sum_b C_b^T H^-1 C_b hangs on V V^T alone, so that M columns do for B.
-        few = np.linalg.qr(state.v, mode="r") @ state.pair[0].reshape(m, -1)
-        coupling = few.reshape(m, m, data.size)[..., cells]
-        schur -= coupling.reshape(-1, cells.size).T @ (inverse[0] @ coupling).reshape(-1, cells.size)
-    else:
-        schur -= coupling.reshape(-1, cells.size).T @ coupled.reshape(-1, cells.size)
-    return 0.5 * (schur + schur.T), inverse, coupled
+    ridge = 1e-14 * np.trace(state.normal, axis1=1, axis2=2)[:, None, None] * np.eye(m)
+    inverse = np.linalg.inv(state.normal + ridge + 1e-300 * np.eye(m))[data.group]
+    for b in np.flatnonzero(~np.all(free, axis=1)):
+        both = free[b, :, None] & free[b]
+        normal = state.normal[data.group[b]]
+        kept = np.where(both, normal, np.eye(m) * np.trace(normal) + 1e-300)
+        inverse[b] = np.where(both, np.linalg.inv(kept + 1e-14 * np.trace(kept) * np.eye(m)), 0.0)
+    return np.asarray(inverse)
+
+
+def _schur(
+    data: Moments, state: _State, free: NDArray[np.bool_], inverse: Array, cells: NDArray[np.intp]
+) -> Array:
+    """S on the given cells, for H_b^-1 as `_inverse` gives them."""
+    m = data.elements
+    schur = data.gram_of_source(state.v)
+    if cells.size < data.size:
+        schur = schur[np.ix_(cells, cells)]
+    whole = np.all(free, axis=1)
+    for g, pair in enumerate(state.pair):
+        alike = np.flatnonzero((data.group == g) & whole)
+        # One H for all of these: sum_b C_b^T H^-1 C_b hangs on V V^T alone, so that M columns do for B.
+        few = state.v[alike] if alike.size <= m else np.linalg.qr(state.v[alike], mode="r")
+        coupling = (few @ pair.reshape(m, -1)).reshape(-1, m, data.size)[..., cells]
+        values, vectors = np.linalg.eigh(state.normal[g])
+        root = vectors / np.sqrt(np.maximum(values, 1e-14 * np.sum(values)) + 1e-300)
+        half = (root.T @ coupling).reshape(-1, cells.size)
+        schur -= half.T @ half
+    bound = np.flatnonzero(~whole)
+    if bound.size:
+        coupling = _coupling(data, state)[bound][..., cells]
+        schur -= coupling.reshape(-1, cells.size).T @ (inverse[bound] @ coupling).reshape(-1, cells.size)
+    return 0.5 * (schur + schur.T)
 
 
 def _coupling(data: Moments, state: _State) -> Array:

@@ -88,11 +88,11 @@ class Windows:
         the entries that are not 0, row by row.
         """
         count, height, elements, width = self.blocks.shape
-        weighted = self.blocks * self.cut(weight[:, None])[..., None]
+        weights = self.cut(weight[:, None])
         ahead = np.arange(width)
         found = []
         for i in range(elements):
-            left = weighted[:, :, i].transpose(0, 2, 1)
+            left = (weights * self.blocks[:, :, i]).transpose(0, 2, 1)
             right = self.blocks[:, :, i:].reshape(count, height, -1)
             product = (left @ right).reshape(count, width, elements - i, width)
             # Rows of N_ij reach from `low` on, over `reach` columns at most: that small table sums the blocks up.
