@@ -37,7 +37,7 @@ _SETTLED = 0.25
 # which the gap says that they are too fine; and the closed form's own error up to which it is a start.
 _FAR_OFF = 2.0
 _GAP = 1.0
-_START = 0.3
+_START = 1.0
 # So many times more than noise explains must coarser knots lose by a quadratic guess for no fit to be tried on them.
 _HOPELESS = 10.0
 # Share of the data that finer knots must leave over.
@@ -160,6 +160,8 @@ def refine(
         if begin == 0:
             break
         begin -= 1
+    if space.rank < problem.card.elements:
+        raise too_few_patterns(space.rank, problem.card.elements)
     raise UndeterminedError(
         "the captures leave the pattern undetermined on the coarsest knots already; capture more light, views or patterns"
     )

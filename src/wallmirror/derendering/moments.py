@@ -59,6 +59,16 @@ class Pairs:
         return int(self.above.shape[0]) // (self.elements * (self.elements + 1) // 2)
 
     @cached_property
+    def _below(self) -> sp.csc_array:
+        """The same matrix the other way round."""
+        return self.above.T
+
+    @cached_property
+    def _of(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """The i and the j of each pair."""
+        return np.triu_indices(self.elements)
+
+    @cached_property
     def _where(self) -> NDArray[np.int64]:
         """Place of each entry in a flat (K, K)."""
         size = self.size
@@ -86,17 +96,17 @@ class Pairs:
 
     def times(self, r: Array) -> Array:
         """N_ij r, shape (M, M, K)."""
-        i, j = np.triu_indices(self.elements)
+        i, j = self._of
         every = np.tile(r, i.size)
         products = np.empty((self.elements, self.elements, r.size))
         products[i, j] = (self.above @ every).reshape(i.size, -1)
-        products[j, i] = (self.above.T @ every).reshape(i.size, -1)
+        products[j, i] = (self._below @ every).reshape(i.size, -1)
         return products
 
     def mixed(self, products: Array) -> Array:
         """sum_ij products_ij N_ij for symmetric products (M, M), dense (K, K)."""
         size = self.size
-        factors = (products - 0.5 * np.diag(np.diag(products)))[np.triu_indices(self.elements)]
+        factors = (products - 0.5 * np.diag(np.diag(products)))[self._of]
         weights = self.above.data * np.repeat(factors, self._counts)
         square = np.bincount(self._where, weights=weights, minlength=size * size).reshape(size, size)
         return np.asarray(square + square.T, dtype=np.float64)
