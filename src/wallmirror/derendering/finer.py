@@ -14,6 +14,7 @@ nearest r among the coarser splines, d^T S d, tells whether those can do at all 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -29,8 +30,10 @@ Array = NDArray[np.float64]
 
 _RIDGE = 1e-10
 _STEPS = 24
-# The search ends when a step adds less than this share of what was found.
+# The search ends when a step adds less than this share of what was found, or when steps add less than half of what the ones
+# before did and so many like the last would not be enough.
 _SETTLED = 0.01
+_MORE = 4
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,15 @@ class Films:
         return float(np.sum(self.weights * (self.data - self.transport @ self.source) ** 2))
 
 
-def score(films: Films, designs: list[sp.csr_array], band: Array, free: NDArray[np.bool_], *, enough: float) -> Finer:
+def score(
+    films: Films,
+    designs: list[sp.csr_array],
+    band: Array,
+    free: NDArray[np.bool_],
+    *,
+    enough: float,
+    least: Callable[[int], float] = lambda _: 0.0,
+) -> Finer:
     """The Newton step from a fit whose V is the best for its F, on the splines of other designs.
 
     Parameters
@@ -119,10 +130,13 @@ def score(films: Films, designs: list[sp.csr_array], band: Array, free: NDArray[
         Coefficients that may move, shape (K,); those among them that the captures do not see are left alone.
     enough:
         Gain at which the search may end.
+    least:
+        Gain that is asked of so many coefficients that take part: where it is out of reach the search may end as well.
     """
     films = films.condensed()
     v = films.source
     moving = free & (band[0] > LEAST_SEEN * max(float(band[0].max()), 1e-300))
+    asked = least(int(np.count_nonzero(moving)))
     band = band * float(np.mean(np.sum(v * v, axis=1)))
     band[0] += _RIDGE * float(band[0].max())
     factor = sl.cholesky_banded(band, lower=True, check_finite=False)
@@ -138,7 +152,7 @@ def score(films: Films, designs: list[sp.csr_array], band: Array, free: NDArray[
 
     x = np.zeros(designs[0].shape[1])
     residual = back(films.unexplained(films.data))
-    along, before, gain = np.zeros_like(x), 1.0, 0.0
+    along, before, gain, added = np.zeros_like(x), 1.0, 0.0, 0.0
     for _ in range(_STEPS):
         preconditioned = np.where(moving, sl.cho_solve_banded((factor, True), residual, check_finite=False), 0.0)
         now = float(residual @ preconditioned)
@@ -154,7 +168,9 @@ def score(films: Films, designs: list[sp.csr_array], band: Array, free: NDArray[
         residual -= length * image
         gain += length * now
         before = now
-        if gain >= enough or length * now < _SETTLED * gain:
+        fading = length * now < added / 2
+        added = length * now
+        if gain >= enough or added < _SETTLED * gain or (fading and gain + _MORE * added < asked):
             break
     return Finer(gain, x, int(np.count_nonzero(moving)))
 

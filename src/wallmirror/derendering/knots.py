@@ -310,8 +310,19 @@ def _tested(
     films = Films(problem.data, problem.fit_weights, transport, fit.source)
     freedom = ladder.freedom(index) - used
     enough = worth(int(np.count_nonzero(free)), freedom) * ladder.variance(fit.objective, freedom)
-    found = score(films, ladder.designs(finer), ladder.band(finer), free, enough=enough)
-    price = worth(max(1, found.free - used), freedom) * ladder.variance(fit.objective - found.gain, freedom)
+
+    def price_of(moving: int, gain: float) -> float:
+        return worth(max(1, moving - used), freedom) * ladder.variance(fit.objective - gain, freedom)
+
+    found = score(
+        films,
+        ladder.designs(finer),
+        ladder.band(finer),
+        free,
+        enough=enough,
+        least=lambda moving: price_of(moving, enough),
+    )
+    price = price_of(found.free, found.gain)
     tell(
         f"knots every {math.degrees(ladder.grids[finer].step):g} deg would lower it by {found.gain:.4g}"
         + ("" if np.all(free) else f" with {found.free} lit coefficients")

@@ -19,7 +19,6 @@ from wallmirror.derendering.moments import Moments, moments
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import SplineGrid, design_matrices
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, banded_gram, closed_form
-
 from wallmirror.transport import Kernel
 
 Array = NDArray[np.float64]

@@ -288,9 +288,7 @@ def _inverse(data: Moments, state: _State, free: NDArray[np.bool_]) -> Array:
     return np.asarray(inverse)
 
 
-def _schur(
-    data: Moments, state: _State, free: NDArray[np.bool_], inverse: Array, cells: NDArray[np.intp]
-) -> Array:
+def _schur(data: Moments, state: _State, free: NDArray[np.bool_], inverse: Array, cells: NDArray[np.intp]) -> Array:
     """S on the given cells, for H_b^-1 as `_inverse` gives them."""
     m = data.elements
     schur = data.gram_of_source(state.v)
