@@ -16,7 +16,8 @@ from scipy.interpolate import BSpline
 
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.finer import Films, Finer, loss, score, worth
-from wallmirror.derendering.likelihood import Fit, information, maximise, moments
+from wallmirror.derendering.information import information
+from wallmirror.derendering.likelihood import Fit, maximise, moments
 from wallmirror.derendering.solve import solve
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
 from wallmirror.derendering.subspace import banded_gram

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.bounds import cramer_rao
-from wallmirror.derendering.likelihood import Fit, information, maximise, moments
+from wallmirror.derendering.information import information
+from wallmirror.derendering.likelihood import Fit, maximise, moments
 from wallmirror.derendering.solve import solve
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
 from wallmirror.geometry import Card, Observer

@@ -30,7 +30,7 @@ from scipy.stats import f as f_distribution
 from wallmirror.derendering.convex import solve_positive
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.facets import EVERY, FITTED, PRIOR_STD, Factor, logarithm
-from wallmirror.derendering.likelihood import information
+from wallmirror.derendering.information import information
 from wallmirror.derendering.moments import moments
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import design_matrices

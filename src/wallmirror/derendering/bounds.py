@@ -19,7 +19,8 @@ import scipy.linalg as sl
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from wallmirror.derendering.likelihood import Information, Moments, information
+from wallmirror.derendering.information import Information, information
+from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.splines import SplineGrid
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from wallmirror.derendering.likelihood import Information
+from wallmirror.derendering.information import Information
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm
 

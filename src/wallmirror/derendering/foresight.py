@@ -13,7 +13,8 @@ from threadpoolctl import threadpool_limits
 
 from wallmirror.brdf import AngleSumBRDF
 from wallmirror.derendering.bounds import cramer_rao
-from wallmirror.derendering.likelihood import information, moments
+from wallmirror.derendering.information import information
+from wallmirror.derendering.moments import moments
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
 from wallmirror.errors import InputError
 from wallmirror.geometry import Card, Observer

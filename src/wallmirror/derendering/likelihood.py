@@ -8,7 +8,7 @@ eliminates V (variable projection; Golub and Pereyra, SIAM J. Numer. Anal. 10(2)
     S = sum_b J_b^T W J_b - C_b^T H_b^-1 C_b,
     S dr = sum_b J_b^T W e_b - C_b^T H_b^-1 F^T W e_b,      dv_b = H_b^-1 (F^T W e_b - C_b dr).
 
-S is also the Fisher information of r with V eliminated; its null vector is r itself, the global scale.
+S is also the Fisher information of r with V eliminated (`information`); its null vector is r itself, the global scale.
 Non-negativity turns each step into a convex quadratic programme, solved by block pivoting (`convex`).
 """
 
@@ -21,9 +21,10 @@ import scipy.linalg as sl
 from numpy.typing import NDArray
 
 from wallmirror.derendering.convex import minimise_above, positive_factor
+from wallmirror.derendering.information import Point, inverses, mixed, point_at, schur_complement
 from wallmirror.derendering.moments import Moments, moments
 
-__all__ = ["Fit", "Information", "Moments", "best_nonnegative", "information", "maximise", "moments"]
+__all__ = ["Fit", "Moments", "best_nonnegative", "maximise", "moments"]
 
 Array = NDArray[np.float64]
 
@@ -60,36 +61,6 @@ class Fit:
     iterations: int
     converged: bool
     schur: Array | None = None
-
-
-@dataclass(frozen=True)
-class Information:
-    """Fisher information at a point of the likelihood, in units of the weights.
-
-    Parameters
-    ----------
-    schur:
-        S over the K' seen coefficients, (K', K').
-    inverse, coupled:
-        H_b^-1 (B, M, M) and H_b^-1 C_b (B, M, K').
-    seen:
-        Which of the K coefficients those are, shape (K,).
-    """
-
-    schur: Array
-    inverse: Array
-    coupled: Array
-    seen: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class _State:
-    r: Array
-    v: Array  # (B, M)
-    normal: Array  # H, (G, M, M)
-    moment: Array  # F^T W d_b, (B, M)
-    pair: Array  # N_ij r, (G, M, M, K)
-    objective: float
 
 
 @dataclass(frozen=True)
@@ -137,7 +108,7 @@ def maximise(
     """
     seen = data.seen
     begins = (np.where(seen, _clipped(data, r) if nonnegative else r, 0.0) for r in starts)
-    states = (_evaluate(data, r, None, nonnegative=nonnegative) for r in begins)
+    states = (point_at(data, r, nonnegative=nonnegative) for r in begins)
     state = min(states, key=lambda candidate: candidate.objective)
     rounding = 1e-14 * float(np.sum(data.energy))
     curvature: _Curvature | None = None
@@ -146,12 +117,12 @@ def maximise(
         enough = tolerance * state.objective + rounding
         dr, slope, curvature = _step(data, state, seen, curvature, (enough, _QUICK * slope), nonnegative=nonnegative)
         if slope <= enough:  # that step as well, since it is made
-            trial = _evaluate(data, state.r + dr, None, nonnegative=nonnegative)
+            trial = point_at(data, state.r + dr, nonnegative=nonnegative)
             state = trial if trial.objective <= state.objective else state
             return _fit(state, iteration, converged=True, curvature=curvature)
         length = 1.0
         while True:
-            trial = _evaluate(data, state.r + length * dr, None, nonnegative=nonnegative)
+            trial = point_at(data, state.r + length * dr, nonnegative=nonnegative)
             if trial.objective <= state.objective - 1e-4 * length * slope:
                 break
             length /= 2
@@ -159,18 +130,6 @@ def maximise(
                 return _fit(state, iteration, converged=slope <= 1e-6 * state.objective + 1e3 * rounding)
         state = trial
     return _fit(state, max_iterations, converged=False)
-
-
-def information(data: Moments, coefficients: Array, source: Array, schur: Array | None = None) -> Information:
-    """The Fisher information at r (K,) and V (M, B); S where a fit has made it already."""
-    seen = data.seen
-    state = _evaluate(data, coefficients, source.T, nonnegative=True)
-    free = np.ones_like(state.v, dtype=bool)
-    inverse = _inverse(data, state, free)
-    cells = np.flatnonzero(seen)
-    coupled = inverse @ _coupling(data, state)[..., cells]
-    schur = _schur(data, state, free, inverse, cells) if schur is None else schur
-    return Information(schur, inverse, coupled, seen)
 
 
 def best_nonnegative(data: Moments, source: Array) -> Array:
@@ -190,33 +149,15 @@ def _clipped(data: Moments, r: Array) -> Array:
     return np.clip(r, 0.0, np.where(weak, np.max(r[~weak], initial=0.0), np.inf))
 
 
-def _fit(state: _State, iterations: int, *, converged: bool, curvature: _Curvature | None = None) -> Fit:
+def _fit(state: Point, iterations: int, *, converged: bool, curvature: _Curvature | None = None) -> Fit:
     # With entries of V at their bounds the curvature counts these as known, which the information does not.
     schur = curvature.schur if curvature is not None and np.all(curvature.free) else None
     return Fit(state.r, state.v.T.copy(), state.objective, iterations, converged, schur)
 
 
-def _evaluate(data: Moments, r: Array, v: Array | None, *, nonnegative: bool) -> _State:
-    m = data.elements
-    pair = np.stack([pairs.times(r) for pairs in data.pairs])
-    normal = pair @ r
-    moment = data.cross @ r  # (B, M)
-    if v is None:
-        level = 1e-14 * np.trace(normal, axis1=1, axis2=2) + 1e-290  # an rho of 0 gives V = 0
-        ridge = level[:, None, None] * np.eye(m)
-        v = np.linalg.solve((normal + ridge)[data.group], moment[..., None])[..., 0]
-        if nonnegative:
-            for b in np.flatnonzero(np.any(v < 0, axis=1)):
-                quadratic_b = normal[data.group[b]] + ridge[data.group[b]]
-                v[b] = minimise_above(np.zeros(m), quadratic_b, moment[b])
-    quadratic = np.einsum("bi,bij,bj->b", v, normal[data.group], v)
-    objective = float(np.sum(data.energy - 2 * np.sum(v * moment, axis=1) + quadratic))
-    return _State(r, v, normal, moment, pair, objective)
-
-
 def _step(
     data: Moments,
-    state: _State,
+    state: Point,
     seen: NDArray[np.bool_],
     last: _Curvature | None,
     between: tuple[float, float],
@@ -229,14 +170,14 @@ def _step(
     is so small that the climb is over, only the curvature of the place itself may say.
     """
     grad_v = state.moment - np.einsum("bij,bj->bi", state.normal[data.group], state.v)
-    grad_r = np.einsum("bi,bik->k", state.v, data.cross) - _mixed(data, state, state.v)
+    grad_r = np.einsum("bi,bik->k", state.v, data.cross) - mixed(data, state, state.v)
     free = (state.v > 0) | (grad_v > 0) if nonnegative else np.ones_like(state.v, dtype=bool)
     grad_v = np.where(free, grad_v, 0.0)
     cells = np.flatnonzero(seen)
 
     def along(curvature: _Curvature) -> tuple[Array, float, _Curvature]:
         eliminated = np.einsum("bij,bj->bi", curvature.inverse, grad_v)
-        right = (grad_r - _mixed(data, state, eliminated))[cells]
+        right = (grad_r - mixed(data, state, eliminated))[cells]
         dr = np.zeros_like(state.r)
         if nonnegative and curvature.pinned is not None:
             dr[cells] = minimise_above(-state.r[cells], curvature.pinned, right)
@@ -252,10 +193,10 @@ def _step(
 
 
 def _curvature(
-    data: Moments, state: _State, free: NDArray[np.bool_], cells: NDArray[np.intp], *, nonnegative: bool
+    data: Moments, state: Point, free: NDArray[np.bool_], cells: NDArray[np.intp], *, nonnegative: bool
 ) -> _Curvature:
-    inverse = _inverse(data, state, free)
-    schur = _schur(data, state, free, inverse, cells)
+    inverse = inverses(data, state, free)
+    schur = schur_complement(data, state, free, inverse, cells)
     r = state.r[cells]
     level = np.trace(schur) / max(1, cells.size)
     if not level > 0:
@@ -264,58 +205,3 @@ def _curvature(
     pinned = schur + level / max(float(r @ r), 1e-300) * np.outer(r, r)
     pinned[np.diag_indices_from(pinned)] += _RIDGE * level
     return _Curvature(free, inverse, schur, pinned, None if nonnegative else positive_factor(pinned))
-
-
-def _mixed(data: Moments, state: _State, other: Array) -> Array:
-    """sum_b J_b^T W F u_b for a pattern u (B, M) beside v: by symmetry also sum_b C_b^T u_b; shape (K,)."""
-    total = np.zeros(data.size)
-    for g, pair in enumerate(state.pair):
-        rows = data.group == g
-        total += np.tensordot(state.v[rows].T @ other[rows], pair, axes=2)
-    return total
-
-
-def _inverse(data: Moments, state: _State, free: NDArray[np.bool_]) -> Array:
-    """H_b^-1 with the rows and columns of fixed source entries zero, shape (B, M, M)."""
-    m = data.elements
-    ridge = 1e-14 * np.trace(state.normal, axis1=1, axis2=2)[:, None, None] * np.eye(m)
-    inverse = np.linalg.inv(state.normal + ridge + 1e-300 * np.eye(m))[data.group]
-    for b in np.flatnonzero(~np.all(free, axis=1)):
-        both = free[b, :, None] & free[b]
-        normal = state.normal[data.group[b]]
-        kept = np.where(both, normal, np.eye(m) * np.trace(normal) + 1e-300)
-        inverse[b] = np.where(both, np.linalg.inv(kept + 1e-14 * np.trace(kept) * np.eye(m)), 0.0)
-    return np.asarray(inverse)
-
-
-def _schur(data: Moments, state: _State, free: NDArray[np.bool_], inverse: Array, cells: NDArray[np.intp]) -> Array:
-    """S on the given cells, for H_b^-1 as `_inverse` gives them."""
-    m = data.elements
-    schur = data.gram_of_source(state.v)
-    if cells.size < data.size:
-        schur = schur[np.ix_(cells, cells)]
-    whole = np.all(free, axis=1)
-    for g, pair in enumerate(state.pair):
-        alike = np.flatnonzero((data.group == g) & whole)
-        # One H for all of these: sum_b C_b^T H^-1 C_b hangs on V V^T alone, so that M columns do for B.
-        few = state.v[alike] if alike.size <= m else np.linalg.qr(state.v[alike], mode="r")
-        coupling = (few @ pair.reshape(m, -1)).reshape(-1, m, data.size)[..., cells]
-        values, vectors = np.linalg.eigh(state.normal[g])
-        root = vectors / np.sqrt(np.maximum(values, 1e-14 * np.sum(values)) + 1e-300)
-        half = (root.T @ coupling).reshape(-1, cells.size)
-        schur -= half.T @ half
-    bound = np.flatnonzero(~whole)
-    if bound.size:
-        coupling = _coupling(data, state)[bound][..., cells]
-        schur -= coupling.reshape(-1, cells.size).T @ (inverse[bound] @ coupling).reshape(-1, cells.size)
-    return 0.5 * (schur + schur.T)
-
-
-def _coupling(data: Moments, state: _State) -> Array:
-    """C_b[i] = sum_j v_j (T_j^T W T_i r), shape (B, M, K)."""
-    b, m = state.v.shape
-    total = np.empty((b, m, data.size))
-    for g, pair in enumerate(state.pair):
-        rows = np.flatnonzero(data.group == g)
-        total[rows] = (state.v[rows] @ pair.reshape(m, -1)).reshape(rows.size, m, data.size)
-    return total
