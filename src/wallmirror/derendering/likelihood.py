@@ -31,8 +31,10 @@ Array = NDArray[np.float64]
 # Cells seen less than this relative to the best-seen one are weak: noise rules them in a start.
 _WEAK = 1e-4
 _RIDGE = 1e-12
-# S is made anew where a step with that of the point before promises more than this share of what the last one did.
+# S is made anew where a step with that of the point before promises more than this share of what the last one did, or so
+# little, as a share of what ends the climb, that the climb seems to be over.
 _QUICK = 0.1
+_SURE = 0.01
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Fit:
     converged:
         Whether the last step was below the tolerance.
     schur:
-        S at the maximum or a step before it that changed next to nothing, over the seen coefficients, where it is at hand.
+        S at the maximum, over the seen coefficients, where it is at hand.
     """
 
     coefficients: Array
@@ -115,10 +117,9 @@ def maximise(
     slope = 0.0
     for iteration in range(1, max_iterations + 1):
         enough = tolerance * state.objective + rounding
-        dr, slope, curvature = _step(data, state, seen, curvature, (enough, _QUICK * slope), nonnegative=nonnegative)
-        if slope <= enough:  # that step as well, since it is made
-            trial = point_at(data, state.r + dr, nonnegative=nonnegative)
-            state = trial if trial.objective <= state.objective else state
+        last, between = curvature, (_SURE * enough, _QUICK * slope)
+        dr, slope, curvature = _step(data, state, seen, last, between, nonnegative=nonnegative)
+        if slope <= enough and curvature is not last:
             return _fit(state, iteration, converged=True, curvature=curvature)
         length = 1.0
         while True:
@@ -166,8 +167,8 @@ def _step(
 ) -> tuple[Array, float, _Curvature]:
     """The Gauss-Newton step in r with V eliminated, the decrease of the objective that it promises, and its curvature.
 
-    Near the maximum the curvature hardly changes: the last step's does for promises `between` two values. Whether a promise
-    is so small that the climb is over, only the curvature of the place itself may say.
+    Near the maximum the curvature hardly changes: the last step's does for promises `between` two values. Whether the climb
+    is over, only the curvature of the place itself may say.
     """
     grad_v = state.moment - np.einsum("bij,bj->bi", state.normal[data.group], state.v)
     grad_r = np.einsum("bi,bik->k", state.v, data.cross) - mixed(data, state, state.v)
