@@ -30,8 +30,10 @@ Array = NDArray[np.float64]
 #: Knot spacings in degrees, each half of the one before.
 NOISY_STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
 # A mismatch in units of what noise makes of it, beyond which knots are too coarse to be fitted; the share of it below
-# which the gap says that they are too fine; and the closed form's own error up to which it is a start.
+# which the gap says that they are too fine; the share of it that finer knots leave if it is not for the knots; and the closed
+# form's own error up to which it is a start.
 _FAR_OFF = 2.0
+_ALIKE = 0.9
 _GAP = 1.0
 _START = 1.0
 
@@ -157,12 +159,14 @@ def _level(ladder: Ladder, index: int, free: Fit, nonnegative: bool) -> Level | 
 def _first_worth_a_fit(ladder: Ladder) -> int:
     """Index of knots whose closed form misses the data's space by about what noise makes it miss, and is a start.
 
-    Coarser ones are far from explaining the films, and a fit on them would only be a start for the next. Where none
-    comes near, or the noise is not known, the search begins with the coarsest.
+    Coarser ones are far from explaining the films, and a fit on them would only be a start for the next. Where finer ones
+    miss as much, it is not for the knots; where none comes near, or the noise is not known, the search begins with the
+    coarsest.
     """
     if ladder.space.rank < ladder.problem.card.elements:
         return 0
     index = max(0, ladder.last - 2)
+    ladder.summed(index)  # which nearly every search asks for, and of which the closed form makes use
     closed = ladder.closed(index)
     expected = expected_mismatch(ladder.problem, ladder.space, closed)
     if math.isnan(expected):
@@ -172,7 +176,9 @@ def _first_worth_a_fit(ladder: Ladder) -> int:
     for finer in range(index + 1, ladder.last + 1):
         if closed.gap < _GAP * closed.mismatch:
             break
-        closed = ladder.closed(finer)
+        coarser, closed = closed, ladder.closed(finer)
         if not closed.mismatch > _FAR_OFF * expected_mismatch(ladder.problem, ladder.space, closed):
             return finer
+        if closed.mismatch > _ALIKE * coarser.mismatch:
+            return finer - 1 if coarser.error < _START else 0
     return 0

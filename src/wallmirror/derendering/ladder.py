@@ -101,9 +101,8 @@ class Ladder:
     def band(self, index: int) -> Array:
         """Lower band of sum_i T_i^T W T_i."""
         if index not in self._bands:
-            alike = self.problem.fit_weights.shape[1] == 1
-            if alike and index < self.last:  # whose moments a fit asks for as well
-                self._bands[index] = self.summed(index).pairs[0].band
+            if index in self._summed and self.problem.fit_weights.shape[1] == 1:
+                self._bands[index] = self._summed[index].pairs[0].band
             else:
                 self._bands[index] = banded_gram(self.problem.weighted(self.designs(index)))
         return self._bands[index]
