@@ -24,7 +24,7 @@ from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
 from wallmirror.geometry import Card, Observer
 from wallmirror.transport import build_kernel, radiance, transport_matrix
 
-from .helpers import EPS, lobes, thesis_card, thesis_observer, up_to_scale
+from .helpers import EPS, assert_undetermined, lobes, thesis_card, thesis_observer, up_to_scale
 
 Array = NDArray[np.float64]
 
@@ -192,6 +192,23 @@ def test_the_schur_complement_is_the_information_without_v(weighted: bool) -> No
     for b in range(6):
         np.testing.assert_allclose(inverse[b], np.linalg.inv(h[:, b, :, b]), rtol=1e-9, atol=1e-9 / scale)
         np.testing.assert_allclose(coupled[b], np.linalg.solve(h[:, b, :, b], c[:, b]), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("apart", "refused"), [(1e-6, True), (1e-2, False)])
+def test_elements_that_the_films_hardly_tell_apart_are_refused(apart: float, refused: bool) -> None:
+    truth = small()
+    first, second, *rest = truth.designs
+    designs = [first, first + apart * (second - first), *rest]
+    films = np.stack([t @ truth.r for t in designs], axis=1) @ truth.v
+    data = films + 1e-4 * np.random.default_rng(0).standard_normal(films.shape)
+
+    def fit() -> Fit:
+        return maximise(moments(data, [sp.csr_array(t) for t in designs]), truth.r, nonnegative=False)
+
+    if refused:  # H has a condition of some 1e12
+        assert "apart" in assert_undetermined(fit)
+    else:
+        assert fit().converged
 
 
 @pytest.mark.parametrize("nonnegative", [False, True])

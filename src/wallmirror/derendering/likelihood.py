@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from wallmirror.derendering.convex import minimise_above, positive_factor
 from wallmirror.derendering.information import Point, inverses, mixed, point_at, schur_complement
 from wallmirror.derendering.moments import Moments, moments
+from wallmirror.errors import UndeterminedError
 
 __all__ = ["Fit", "Moments", "best_nonnegative", "maximise", "moments"]
 
@@ -35,6 +36,8 @@ _RIDGE = 1e-12
 # little, as a share of what ends the climb, that the climb seems to be over.
 _QUICK = 0.1
 _SURE = 0.01
+# Condition of H beyond which S, that C^T H^-1 C is taken from, keeps too few of its digits for a step without bounds.
+_LOST = 1e10
 
 
 @dataclass(frozen=True)
@@ -107,6 +110,11 @@ def maximise(
         Keep r >= 0 and V >= 0.
     tolerance:
         Stop when a full step promises to change the objective by less than this share.
+
+    Raises
+    ------
+    UndeterminedError
+        When the information is singular to rounding: nothing determines r, or V for an r that the climb comes through.
     """
     seen = data.seen
     begins = (np.where(seen, _clipped(data, r) if nonnegative else r, 0.0) for r in starts)
@@ -196,6 +204,10 @@ def _step(
 def _curvature(
     data: Moments, state: Point, free: NDArray[np.bool_], cells: NDArray[np.intp], *, nonnegative: bool
 ) -> _Curvature:
+    if not nonnegative and np.max(np.linalg.cond(state.normal)) > _LOST:
+        raise UndeterminedError(
+            "the captures do not tell the card's elements apart; capture more light, views or patterns"
+        )
     inverse = inverses(data, state, free)
     schur = schur_complement(data, state, free, inverse, cells)
     r = state.r[cells]
