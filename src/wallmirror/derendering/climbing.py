@@ -165,7 +165,8 @@ def _tested(
         ladder.band(finer),
         free,
         enough=enough,
-        least=lambda moving: price_of(moving, enough),
+        # From the maximum a search finds less with each step; from a fit that bounds hold elsewhere it may find most late.
+        least=(lambda moving: price_of(moving, enough)) if np.all(free) else None,
     )
     price = price_of(found.free, found.gain)
     tell(

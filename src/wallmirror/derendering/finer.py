@@ -116,7 +116,7 @@ def score(
     free: NDArray[np.bool_],
     *,
     enough: float,
-    least: Callable[[int], float] = lambda _: 0.0,
+    least: Callable[[int], float] | None = None,
 ) -> Finer:
     """The Newton step from a fit whose V is the best for its F, on the splines of other designs.
 
@@ -131,12 +131,13 @@ def score(
     enough:
         Gain at which the search may end.
     least:
-        Gain that is asked of so many coefficients that take part: where it is out of reach the search may end as well.
+        Gain that is asked of so many coefficients that take part: where it is out of reach the search may end as well. Not
+        to be given for a V and r that are not the best on the coarser knots.
     """
     films = films.condensed()
     v = films.source
     moving = free & (band[0] > LEAST_SEEN * max(float(band[0].max()), 1e-300))
-    asked = least(int(np.count_nonzero(moving)))
+    asked = 0.0 if least is None else least(int(np.count_nonzero(moving)))
     band = band * float(np.mean(np.sum(v * v, axis=1)))
     band[0] += _RIDGE * float(band[0].max())
     factor = sl.cholesky_banded(band, lower=True, check_finite=False)
