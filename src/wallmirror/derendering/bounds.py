@@ -19,6 +19,7 @@ import scipy.linalg as sl
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from wallmirror.derendering.groups import Groups
 from wallmirror.derendering.information import Information, information
 from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.splines import SplineGrid
@@ -87,6 +88,7 @@ def bound_of(
     coefficients: Array,
     source: Array,
     gauge: Array,
+    groups: Groups | None = None,
 ) -> Bound:
     """The bound that a Fisher information gives, whatever the noise: normal (`cramer_rao`) or of counts (`poisson`).
 
@@ -96,18 +98,22 @@ def bound_of(
         The information at (r, V).
     coefficients, source, gauge:
         As for `cramer_rao`.
+    groups:
+        Of elements that have a scale each: then `gauge` has a row for each, (G, K).
     """
     schur, inverse, coupled, seen = known.schur, known.inverse, known.coupled, known.seen
-    c, r = gauge[seen], coefficients[seen]
-    strength = float(np.trace(schur)) / max(1, schur.shape[0]) / max(float(c @ c), 1e-300)
-    pinned = schur + strength * np.outer(c, c)
+    c, r = np.atleast_2d(gauge)[:, seen], coefficients[seen]
+    # A null direction of S for each scale that is free: the group's part of r.
+    null = r[None] if groups is None else np.where(groups.cells[:, seen], r, 0.0)
+    patterns = source.T[None] if groups is None else np.stack([_only(source, each).T for each in groups.elements])
+    strength = float(np.trace(schur)) / max(1, schur.shape[0]) / max(float(np.sum(c * c)), 1e-300) * len(c)
+    pinned = schur + strength * c.T @ c
     # Barely seen cells: a ridge far below their neighbours' information keeps their (huge) variance finite.
     # And no ridge below the rounding of S, which subtracts C^T H^-1 C with the condition of H.
     lost = max(1e-12, 4 * np.finfo(np.float64).eps * float(np.max(np.linalg.cond(inverse))))
     ridge = lost * float(np.trace(schur)) / max(1, schur.shape[0])
-    along = float(c @ r)
-
-    scale = np.zeros_like(r) if along == 0 else r / (math.sqrt(strength) * along)
+    along = np.sum(c * null, axis=1, keepdims=True)
+    scale = np.divide(null, math.sqrt(strength) * along, out=np.zeros_like(null), where=along != 0)
     rows = coupled.reshape(-1, r.size)
 
     def factor(ridge: float) -> Array:
@@ -121,16 +127,16 @@ def bound_of(
             lower = factor(ridge)
         except np.linalg.LinAlgError:  # rounding took more than it should: what is left is no bound
             ridge, sound = 100 * max(ridge, 1e-290), False
-    covariance = _inverse(lower) - np.outer(scale, scale)
+    covariance = _inverse(lower) - scale.T @ scale
     spread = (rows @ covariance).reshape(coupled.shape)
-    error = _scale_free_error(source, inverse, coupled, spread)
+    error = _scale_free_error(patterns, inverse, coupled, spread)
     # What the ridge alone holds, nothing holds: a bound on V that falls with it is none. It is convex in the ridge, so that
     # its slope tells how far it may fall at most.
-    whole = spread.reshape(rows.shape) + np.outer(rows @ scale, scale)  # [H^-1 C] of the pinned information's inverse
+    whole = spread.reshape(rows.shape) + (rows @ scale.T) @ scale  # [H^-1 C] of the pinned information's inverse
     most = 9 * ridge * float(np.sum(whole * whole)) / max(float(np.sum(source * source)), 1e-300)
     if sound and not error**2 - most >= (_KEPT * error) ** 2:
-        solved = sl.cho_solve((factor(10 * ridge), True), rows.T, check_finite=False).T - np.outer(rows @ scale, scale)
-        sound = _scale_free_error(source, inverse, coupled, solved.reshape(coupled.shape)) >= _KEPT * error
+        solved = sl.cho_solve((factor(10 * ridge), True), rows.T, check_finite=False).T - (rows @ scale.T) @ scale
+        sound = _scale_free_error(patterns, inverse, coupled, solved.reshape(coupled.shape)) >= _KEPT * error
     if not sound:
         error = float("inf")
     variance = np.einsum("bii->bi", inverse) + np.sum(spread * coupled, axis=-1)
@@ -138,7 +144,7 @@ def bound_of(
         coefficients=covariance,
         seen=seen,
         source_std=np.sqrt(np.maximum(variance, 0.0)).T,
-        shape_std=_shape_std(source, inverse, coupled, spread, variance),
+        shape_std=_shape_std(patterns, inverse, coupled, spread, variance),
         source_error=error,
     )
 
@@ -152,28 +158,37 @@ def _inverse(lower: Array) -> Array:
     return np.asarray(half + np.tril(half, -1).T, dtype=np.float64)
 
 
-def _shape_std(source: Array, inverse: Array, coupled: Array, spread: Array, variance: Array) -> Array:
-    """Standard deviation of V freed of its part along V: Var(dv - v (v dv) / |v|^2), shape (M, B)."""
-    v = source.T
-    norm = max(float(np.sum(v * v)), 1e-300)
-    pulled = np.einsum("bi,bik->k", v, spread)
-    together = np.einsum("bij,bj->bi", inverse, v) + np.einsum("bik,k->bi", coupled, pulled)
-    along = float(np.sum(v * together))
-    free = variance - 2 * v * together / norm + v * v * along / norm**2
+def _only(source: Array, elements: tuple[int, ...]) -> Array:
+    part = np.zeros_like(source)
+    part[list(elements)] = source[list(elements)]
+    return part
+
+
+def _shape_std(patterns: Array, inverse: Array, coupled: Array, spread: Array, variance: Array) -> Array:
+    """Standard deviation of V freed of its part along each pattern v: Var(dv - v (v dv) / |v|^2), shape (M, B)."""
+    free = variance
+    for v in patterns:
+        norm = max(float(np.sum(v * v)), 1e-300)
+        pulled = np.einsum("bi,bik->k", v, spread)
+        together = np.einsum("bij,bj->bi", inverse, v) + np.einsum("bik,k->bi", coupled, pulled)
+        along = float(np.sum(v * together))
+        free = free - 2 * v * together / norm + v * v * along / norm**2
     return np.asarray(np.sqrt(np.maximum(free, 0.0)).T, dtype=np.float64)
 
 
-def _scale_free_error(source: Array, inverse: Array, coupled: Array, spread: Array) -> float:
-    """sqrt(E |dV|^2) / |V| with dV freed of its part along V, which a global scale absorbs.
+def _scale_free_error(patterns: Array, inverse: Array, coupled: Array, spread: Array) -> float:
+    """sqrt(E |dV|^2) / |V| with dV freed of its part along each pattern (B, M) of its own scale, which that absorbs.
 
     `spread` is [H_b^-1 C_b] Cov(r), shape (B, M, K').
     """
-    v = source.T  # (B, M)
-    norm = float(np.sum(v * v))
-    if norm == 0:
+    norms = np.sum(patterns**2, axis=(1, 2))
+    if not np.sum(norms) > 0:
         return float("inf")
     total = float(np.einsum("bii->", inverse)) + float(np.sum(spread * coupled))
-    # Along V: v^T Cov v / |V|^2.
-    pulled = np.einsum("bi,bik->k", v, coupled)
-    along = float(np.einsum("bi,bij,bj->", v, inverse, v)) + float(np.einsum("bi,bik,k->", v, spread, pulled))
-    return float(np.sqrt(max(total - along / norm, 0.0) / norm))
+    for v, norm in zip(patterns, norms, strict=True):
+        if norm > 0:
+            # Along V: v^T Cov v / |V|^2.
+            pulled = np.einsum("bi,bik->k", v, coupled)
+            along = float(np.einsum("bi,bij,bj->", v, inverse, v)) + float(np.einsum("bi,bik,k->", v, spread, pulled))
+            total -= along / float(norm)
+    return float(np.sqrt(max(total, 0.0) / float(np.sum(norms))))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from wallmirror.derendering.bounds import Bound, bound_of
 from wallmirror.derendering.climbing import Other, Tell, climb
+from wallmirror.derendering.groups import Groups
 from wallmirror.derendering.information import Information, information
 from wallmirror.derendering.ladder import Ladder
 from wallmirror.derendering.likelihood import Fit, maximise
@@ -46,6 +47,8 @@ class Level:
     ----------
     free, fit:
         The maxima of the likelihood without bounds and with those that were asked for.
+    groups:
+        Of elements that share no coefficient; the fit has each in a scale of its own.
     """
 
     grid: SplineGrid
@@ -54,6 +57,7 @@ class Level:
     closed: ClosedForm
     free: Fit
     fit: Fit
+    groups: Groups
 
     @property
     def parameters(self) -> int:
@@ -73,15 +77,18 @@ class Level:
     @cached_property
     def bound(self) -> Bound:
         """The Cramer-Rao bound at the fit, for noise of unit variance in units of the weights."""
-        return self._bound(self.information, self.fit.source)
+        return self._bound_of(self.information, self.fit.source)
 
     def bound_at(self, source: Array) -> Bound:
         """The bound at the fit's rho and another V, shape (M, B)."""
-        return self._bound(information(self.summed, self.fit.coefficients, source), source)
+        return self._bound_of(information(self.summed, self.fit.coefficients, source), source)
 
-    def _bound(self, known: Information, source: Array) -> Bound:
-        gauge = self.grid.row(self.peak_at)
-        return bound_of(known, coefficients=self.fit.coefficients, source=source, gauge=gauge)
+    def _bound_of(self, known: Information, source: Array) -> Bound:
+        if len(self.groups) == 1:
+            gauge = self.grid.row(self.peak_at)
+            return bound_of(known, coefficients=self.fit.coefficients, source=source, gauge=gauge)
+        gauges = self.groups.gauges(self.grid, self.fit.coefficients, self.summed.exposure)
+        return bound_of(known, coefficients=self.fit.coefficients, source=source, gauge=gauges, groups=self.groups)
 
 
 @dataclass(frozen=True)
@@ -152,7 +159,10 @@ def _level(ladder: Ladder, index: int, free: Fit, nonnegative: bool) -> Level | 
     """The fit within the bounds asked for, or None where its error bars say that nothing determines it."""
     summed = ladder.summed(index)
     fit = ladder.bounded(index, free) if nonnegative else maximise(summed, free.coefficients, nonnegative=False)
-    level = Level(ladder.grids[index], ladder.designs(index), summed, ladder.closed(index), free, fit)
+    grid, groups = ladder.grids[index], ladder.groups(index)
+    if len(groups) > 1:
+        fit = groups.scaled(fit, grid, summed.exposure)
+    level = Level(grid, ladder.designs(index), summed, ladder.closed(index), free, fit, groups)
     return level if math.isfinite(level.bound.source_error) else None
 
 

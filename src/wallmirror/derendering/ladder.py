@@ -6,7 +6,7 @@ Every grid halves the knot spacing of the one before, so that the splines of eac
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -14,6 +14,7 @@ import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
 
 from wallmirror.derendering.finer import worth
+from wallmirror.derendering.groups import Groups, closed_form_in_groups, groups_of
 from wallmirror.derendering.likelihood import Fit, best_nonnegative, maximise
 from wallmirror.derendering.moments import Moments, moments
 from wallmirror.derendering.problem import Problem
@@ -87,16 +88,27 @@ class Ladder:
     def summed(self, index: int) -> Moments:
         """What the likelihood needs of the data."""
         if index not in self._summed:
-            self._summed[index] = moments(self.problem.data, self.designs(index), self.problem.inverse_variance)
+            made, groups = (
+                moments(self.problem.data, self.designs(index), self.problem.inverse_variance),
+                self.groups(index),
+            )
+            self._summed[index] = replace(made, apart=groups.cells) if len(groups) > 1 else made
         return self._summed[index]
 
     def closed(self, index: int) -> ClosedForm:
         """The closed form."""
         if index not in self._closed:
-            weighted = self.problem.weighted(self.designs(index))
-            band = self.band(index)
-            self._closed[index] = closed_form(self.problem.weighted_data, weighted, self.space, band=band)
+            weighted, groups = self.problem.weighted(self.designs(index)), self.groups(index)
+            if len(groups) > 1:
+                made = closed_form_in_groups(self.problem.weighted_data, weighted, self.space, groups)
+            else:
+                made = closed_form(self.problem.weighted_data, weighted, self.space, band=self.band(index))
+            self._closed[index] = made
         return self._closed[index]
+
+    def groups(self, index: int) -> Groups:
+        """The elements that share coefficients on these knots."""
+        return groups_of(self.designs(index))
 
     def band(self, index: int) -> Array:
         """Lower band of sum_i T_i^T W T_i."""

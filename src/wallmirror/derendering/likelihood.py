@@ -214,7 +214,9 @@ def _curvature(
     level = np.trace(schur) / max(1, cells.size)
     if not level > 0:
         return _Curvature(free, inverse, schur, None, None)
-    # The gauge r r^T keeps the step off the scale's null direction; the ridge is for barely seen cells.
-    pinned = schur + level / max(float(r @ r), 1e-300) * np.outer(r, r)
+    # The gauge r r^T keeps the step off the null direction of each scale; the ridge is for barely seen cells.
+    null = r[None] if data.apart is None else np.where(data.apart[:, cells], r, 0.0)
+    null = null / np.maximum(np.linalg.norm(null, axis=1, keepdims=True), 1e-150)
+    pinned = schur + level * null.T @ null
     pinned[np.diag_indices_from(pinned)] += _RIDGE * level
     return _Curvature(free, inverse, schur, pinned, None if nonnegative else positive_factor(pinned))

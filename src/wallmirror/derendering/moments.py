@@ -17,6 +17,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from wallmirror.derendering.windows import Windows
+from wallmirror.memory import pairs_bytes, require_memory
 
 Array = NDArray[np.float64]
 
@@ -128,6 +129,8 @@ class Moments:
         sum_p w d^2 of each realisation, shape (B,).
     observations:
         Number of data with weight > 0.
+    apart:
+        Which coefficients belong to each of several groups that have a scale each, shape (G, K); None for one scale.
     """
 
     pairs: list[Pairs]
@@ -135,6 +138,7 @@ class Moments:
     cross: Array
     energy: Array
     observations: int
+    apart: NDArray[np.bool_] | None = None
 
     @property
     def elements(self) -> int:
@@ -183,6 +187,11 @@ def moments(data: Array, designs: list[sp.csr_array], inverse_variance: Array | 
     weighted = full * data
     cross = np.stack([(t.T @ weighted).T for t in designs], axis=1)
     windows = Windows.of(designs)
+    if windows is not None:
+        require_memory(
+            pairs_bytes(windows.most_entries(), weights.shape[1]),
+            f"a fit of {len(designs)} elements on {designs[0].shape[1]} knots",
+        )
     return Moments(
         pairs=[Pairs.of(designs, windows, weights[:, g]) for g in range(weights.shape[1])],
         group=group,

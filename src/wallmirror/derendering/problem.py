@@ -16,7 +16,7 @@ from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, noise_edge, signal_space, space_within
 from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card
-from wallmirror.memory import film_bytes, require_memory
+from wallmirror.memory import require_memory, solution_bytes
 from wallmirror.transport import Kernel, build_kernel
 
 Array = NDArray[np.float64]
@@ -141,11 +141,11 @@ def prepare(
         If the memory does not hold the captures and what is made of them.
     """
     views, pixels, realisations = captures.radiance.shape
+    elements = captures.card.elements
     require_memory(
-        film_bytes(views, pixels, realisations),
+        solution_bytes(views, pixels, elements, realisations),
         f"a solution from {views} views x {pixels} pixels x {realisations} realisations",
     )
-    elements = captures.card.elements
     if len(set(captures.card.elements_x)) < elements:
         raise UndeterminedError(
             "two elements of the card stand at the same place, so their light cannot be told apart; give each its "

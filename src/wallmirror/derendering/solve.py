@@ -201,8 +201,10 @@ def solve(
                 if not quiet or exact is None:
                     raise
                 estimate = exact  # refused below, and the closed form knows the better reason
+            if quiet and exact is not None and estimate.groups:
+                estimate = exact  # without noise it tells whether a scale each is all that is free
         angle_sum = None
-        if estimate.method in FITS and estimate.predicted_error <= UNDETERMINED:
+        if estimate.method in FITS and estimate.predicted_error <= UNDETERMINED and not estimate.groups:
             angle_sum = check_angle_sum(problem, estimate)
             if wall == "microfacet" or (wall == "auto" and angle_sum.rejects(estimate.predicted_error)):
                 problem, estimate, angle_sum = fit_facets(problem, angle_sum, fit, tell)

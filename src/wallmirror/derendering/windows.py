@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from wallmirror.derendering.subspace import run_length
 
@@ -78,6 +79,22 @@ class Windows:
         placed = np.zeros((count * height, films.shape[1]))
         placed[self.slot] = films
         return placed.reshape(count, height, -1)
+
+    def most_entries(self) -> int:
+        """Entries that `grams` will find at most, without a look at a value: rows of N_ij reach as far as the windows of j do
+        where those of i cover the row."""
+        width, elements = self.blocks.shape[3], self.begin.shape[1]
+        total = 0
+        for i in range(elements):
+            low = np.full((self.size, elements - i), self.size)
+            high = np.full((self.size, elements - i), -1)
+            np.minimum.at(low, self.begin[:, i], self.begin[:, i:])
+            np.maximum.at(high, self.begin[:, i], self.begin[:, i:])
+            # A row lies in windows that begin up to a width before it.
+            low = minimum_filter1d(low, width, axis=0, origin=(width - 1) // 2, mode="constant", cval=self.size)
+            high = maximum_filter1d(high, width, axis=0, origin=(width - 1) // 2, mode="constant", cval=-1)
+            total += int(np.sum((high - low + width)[high >= low]))
+        return total
 
     def grams(self, weight: Array) -> tuple[NDArray[np.intp], Indices, Array]:
         """N_ij = T_i^T W T_j for i <= j, in the order (0, 0), (0, 1), ..., (0, M - 1), (1, 1), ...
