@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+import mpmath
 import numpy as np
+from numpy.typing import ArrayLike
 
 import wallmirror as wm
 
@@ -59,3 +61,40 @@ def run(case: Case) -> Cell:
     if not error <= tolerance:
         return Cell(*name, "fault", error, tolerance, f"off by {error:.1e}, allowed {tolerance:.1e}")
     return Cell(*name, "right", error, tolerance, "")
+
+
+def off(found: ArrayLike, exact: ArrayLike) -> float:
+    """Largest difference relative to the largest exact magnitude; NaN where anything found is none or missing.
+
+    Both are taken in units of that magnitude, so that neither 1e300 nor a denormal leaves the range of float64.
+    """
+    one, two = np.asarray(found, dtype=np.float64), np.asarray(exact, dtype=np.float64)
+    if one.shape != two.shape or not np.all(np.isfinite(one)):
+        return math.nan
+    largest = float(np.max(np.abs(two)))
+    if largest == 0:
+        return 0.0 if not np.any(one) else math.inf
+    exponent = math.frexp(largest)[1]
+    return float(np.max(np.abs(np.ldexp(one, -exponent) - np.ldexp(two, -exponent)))) / math.ldexp(largest, -exponent)
+
+
+def off_relative(found: ArrayLike, exact: Iterable[mpmath.mpf]) -> float:
+    """Largest relative difference of single values, at the precision that mpmath has; below 1e-290 they may be 0."""
+
+    def ratio(value: float, true: mpmath.mpf) -> float:
+        if not math.isfinite(value):
+            return math.nan
+        if abs(true) < mpmath.mpf("1e-290"):
+            return 0.0 if abs(value) < 1e-289 else math.inf
+        return float(abs(mpmath.mpf(value) / true - 1))
+
+    return float(np.max([ratio(float(f), e) for f, e in zip(np.ravel(found), exact, strict=True)]))
+
+
+def must_refuse(call: Callable[[], object]) -> Callable[[], tuple[float, float]]:
+    """The check of an input that has no right answer: whatever comes back is a fault."""
+
+    def check() -> tuple[float, float]:
+        raise RuntimeError(f"accepted, with the result {str(call())[:60]}")
+
+    return check

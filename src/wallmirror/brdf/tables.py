@@ -177,7 +177,7 @@ def _relative(error: float, values: Array) -> float:
 def _cell(theta: ArrayLike, size: int) -> tuple[NDArray[np.intp], Array]:
     """Index and fraction of angles in a uniform grid of `size` nodes over [-pi/2, pi/2]."""
     place = (np.asarray(theta, dtype=np.float64) / math.pi + 0.5) * (size - 1)
-    index = np.clip(np.floor(place), 0, size - 2).astype(np.intp)
+    index = np.fmax(np.fmin(np.floor(place), size - 2), 0).astype(np.intp)  # of a NaN any, which its fraction keeps
     return index, np.clip(place - index, 0.0, 1.0)
 
 
