@@ -1,0 +1,28 @@
+"""Powers of two as units, in which values of any size keep their digits and no square leaves the range of float64."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def power_of_two(values: ArrayLike) -> float:
+    """A power of two near the largest magnitude, a unit in which it is about 1; 1 where all values are zero.
+
+    Division by it and multiplication with it are exact, so that what is computed in this unit scales exactly by powers of
+    two. It stays within 2^-1021 and 2^1022, so that neither it nor its reciprocal is denormal or infinite.
+
+    Examples
+    --------
+    >>> power_of_two([3.0, -5.0]), power_of_two([0.0])
+    (8.0, 1.0)
+    """
+    array = np.asarray(values, dtype=np.float64)
+    largest = max(float(array.max(initial=0.0)), -float(array.min(initial=0.0)))
+    if largest == 0:
+        return 1.0
+    return math.ldexp(1.0, min(max(math.frexp(largest)[1], -1021), 1022))
