@@ -145,7 +145,9 @@ def albedo_cases() -> Iterator[Case]:
                 # A panel as wide as the lobe has four nodes: 1e-6 of a lobe's integral.
                 return abs(found - float(exact)) / min(1.0, 4 * w), 1e-6
 
-            yield Case("directional_albedo", "incidence, lobe's width", f"{math.degrees(angle):.6g}°, {sigma:g} rad", lobe)
+            yield Case(
+                "directional_albedo", "incidence, lobe's width", f"{math.degrees(angle):.6g}°, {sigma:g} rad", lobe
+            )
     for exponent in (0.0, 1.0, 1e3, 1e8):
         for name, brdf in (("Phong", wm.Phong(exponent=exponent)), ("Blinn", wm.Blinn(exponent=exponent))):
             # Conserving: the share at normal incidence is the reflectance, 1/2. A lobe of exponent 0 is cut at 90 deg.
@@ -197,9 +199,15 @@ def audit_cases() -> Iterator[Case]:
     for alpha in (1e-3, 0.2, 1.0):
         yield Case("audit", "Cook and Torrance's alpha", f"{alpha:g}", expect(
             lambda a=alpha: wm.CookTorrance(alpha=a), None, True))  # fmt: skip
-    yield Case("audit", "table", "two nodes", expect(lambda: wm.Table(values=[[0.1, 0.1], [0.1, 0.1]]), 0.1 * math.pi, True))
-    yield Case("audit", "table", "too bright", expect(lambda: wm.Table(values=[[1.0, 1.0], [1.0, 1.0]]), math.pi, False))
-    yield Case("audit", "table", "not reciprocal", expect(lambda: wm.Table(values=[[0.1, 0.2], [0.1, 0.1]]), None, False))
+    yield Case(
+        "audit", "table", "two nodes", expect(lambda: wm.Table(values=[[0.1, 0.1], [0.1, 0.1]]), 0.1 * math.pi, True)
+    )
+    yield Case(
+        "audit", "table", "too bright", expect(lambda: wm.Table(values=[[1.0, 1.0], [1.0, 1.0]]), math.pi, False)
+    )
+    yield Case(
+        "audit", "table", "not reciprocal", expect(lambda: wm.Table(values=[[0.1, 0.2], [0.1, 0.1]]), None, False)
+    )
     yield Case("audit", "lobe's width", "1e-12 rad", must_refuse(
         lambda: wm.audit(wm.GaussianTrain(centres=(0.0,), sigma=1e-12))))  # fmt: skip
     for tolerance in (-1.0, 2.0, math.nan, math.inf):

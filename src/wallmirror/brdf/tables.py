@@ -112,12 +112,16 @@ def tabulate(brdf: AngleSumBRDF, nodes: int = 7201) -> AngleSumTable:
         lies outside the range of float32.
     """
     if not isinstance(brdf, AngleSumBRDF):
-        raise InputError(f"is a {type(brdf).__name__}, no function of the angle sum; use tabulate_to", field="wall.brdf")
+        raise InputError(
+            f"is a {type(brdf).__name__}, no function of the angle sum; use tabulate_to", field="wall.brdf"
+        )
     require_range("nodes", nodes, 2, MOST_SUM_NODES)
     values = brdf.of_sum(np.linspace(-math.pi, math.pi, nodes))
     largest, single = float(values.max()), np.finfo(np.float32)
     if largest != 0 and not float(single.tiny) <= largest <= float(single.max):
-        raise InputError(f"peaks at {largest:.3g} / sr, outside the range of float32; use other units", field="wall.brdf")
+        raise InputError(
+            f"peaks at {largest:.3g} / sr, outside the range of float32; use other units", field="wall.brdf"
+        )
     return AngleSumTable(start=-math.pi, stop=math.pi, values=values.astype(np.float32))
 
 
