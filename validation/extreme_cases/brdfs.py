@@ -159,7 +159,7 @@ def facet_cases() -> Iterator[Case]:
                 def facet(d: str = distribution, f: str = facets, a: float = alpha) -> tuple[float, float]:
                     brdf = wm.CookTorrance(alpha=a, distribution=d, facets=f)  # type: ignore[arg-type]
                     with mpmath.workdps(DIGITS):
-                        exact = [float(_cook_torrance(d, f, a, s, o)) for s, o in PAIRS]
+                        exact = [float(exact_cook_torrance(d, f, a, s, o)) for s, o in PAIRS]
                     found = [float(brdf(s, o)) for s, o in PAIRS]
                     # Relative to the value's lobe at that pair: its exponent, or the slope's square, over alpha.
                     return off(found, exact), 64 * EPS / a
@@ -172,13 +172,13 @@ def facet_cases() -> Iterator[Case]:
         def indexed(n: float = eta) -> tuple[float, float]:
             brdf = wm.CookTorrance(alpha=0.2, fresnel=wm.Fresnel(eta=n))
             with mpmath.workdps(DIGITS):
-                exact = [float(_cook_torrance("ggx", "grooves", 0.2, s, o, n)) for s, o in PAIRS]
+                exact = [float(exact_cook_torrance("ggx", "grooves", 0.2, s, o, n)) for s, o in PAIRS]
             return off([float(brdf(s, o)) for s, o in PAIRS], exact), 512 * EPS
 
         yield Case("CookTorrance", "eta", f"{eta:.10g}", indexed)
 
 
-def _cook_torrance(distribution: str, facets: str, alpha: float, s: float, o: float, eta: float = 1.5) -> mpmath.mpf:
+def exact_cook_torrance(distribution: str, facets: str, alpha: float, s: float, o: float, eta: float = 1.5) -> mpmath.mpf:
     """F D G1 G1 over the normalising cosines (Walter et al. 2007, eqs. 20, 25, 33 to 35), angles taken as exact."""
     mp = mpmath
     a, ts, to = mp.mpf(alpha), mp.mpf(s), mp.mpf(o)
