@@ -51,6 +51,25 @@ def quadrature_order(width: float, tolerance: float) -> int:
     raise too_wide
 
 
+def order_across_peak(width: float, tolerance: float) -> int:
+    """Gauss-Legendre order that averages 1 / (1 + x^2), and its powers, over an interval of `width` at any place.
+
+    The function has poles at x = +-i, and the rule's error falls as r^(-2 n) with r the sum of the semi-axes of the ellipse
+    through them whose foci are the interval's ends (Davis and Rabinowitz 1984, section 4.6): log r = asinh(2 / width) where
+    the peak is in the middle.
+    """
+    if width <= 0:
+        return 1
+    order = math.log(4 / tolerance) / (2 * math.asinh(2 / width))
+    if order > MAX_ORDER:
+        raise InputError(
+            f"a strip or pixel is {width:.3g} times as wide as the card is far, more than {MAX_ORDER} quadrature nodes "
+            f"resolve to {tolerance:g}; narrow the strips, use more pixels or move the card away",
+            field="card.element_width",
+        )
+    return max(1, math.ceil(order))
+
+
 @functools.cache
 def gauss_legendre(order: int) -> tuple[Array, Array]:
     """Nodes and weights on [-1, 1], kept: a search for the card asks for the same ones hundreds of times."""
