@@ -40,6 +40,13 @@ class Room:
     depth: float
     albedo: float
 
+    def __post_init__(self) -> None:
+        for name in ("half_width", "half_height", "depth"):
+            if not 1e-100 <= getattr(self, name) <= 1e100:
+                raise InputError(f"is {getattr(self, name):g}; give a length > 0 in metres", field=f"room.{name}")
+        if not 0 <= self.albedo < 1:
+            raise InputError(f"is {self.albedo:g}; an albedo lies in [0, 1)", field="room.albedo")
+
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:

@@ -178,7 +178,9 @@ def facet_cases() -> Iterator[Case]:
         yield Case("CookTorrance", "eta", f"{eta:.10g}", indexed)
 
 
-def exact_cook_torrance(distribution: str, facets: str, alpha: float, s: float, o: float, eta: float = 1.5) -> mpmath.mpf:
+def exact_cook_torrance(
+    distribution: str, facets: str, alpha: float, s: float, o: float, eta: float = 1.5
+) -> mpmath.mpf:
     """F D G1 G1 over the normalising cosines (Walter et al. 2007, eqs. 20, 25, 33 to 35), angles taken as exact."""
     mp = mpmath
     a, ts, to = mp.mpf(alpha), mp.mpf(s), mp.mpf(o)

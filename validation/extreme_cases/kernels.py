@@ -86,7 +86,9 @@ def two_angle_cases() -> Iterator[Case]:
                 rounding = 1 / math.cos(math.radians(d + 30)) ** 2 + float(np.abs(wm.wall_points(eye)).max()) / m
                 return off(found, exact), 64 * EPS * (1 + rounding) / 0.3
 
-            yield Case("transport_matrix, two angles", "view angle, card's distance", f"{degrees:g}°, {metres:g} m", facets)
+            yield Case(
+                "transport_matrix, two angles", "view angle, card's distance", f"{degrees:g}°, {metres:g} m", facets
+            )
     for power in (-900, -300, 300, 990):
 
         def brdf_scaled(p: int = power) -> tuple[float, float]:
@@ -147,7 +149,9 @@ def option_cases() -> Iterator[Case]:
             yield Case("strip_factor", "half height at a height", f"{half:g} at {centre:g} m", off_centre)
 
 
-def counted_mirror(eye: wm.Observer, strips: wm.Card, view: int, pixel: int, element: int, rays: int = 400_000) -> float:
+def counted_mirror(
+    eye: wm.Observer, strips: wm.Card, view: int, pixel: int, element: int, rays: int = 400_000
+) -> float:
     """The share of a pixel's rays that a mirror sends onto a strip: even columns of rays, the heights in closed form."""
     half = pixel_half_width(eye)
     t = float(pixel_tangents(eye)[pixel]) + half * (2 * (np.arange(rays) + 0.5) / rays - 1)
@@ -211,7 +215,9 @@ def product_cases() -> Iterator[Case]:
 
         def scaled(p: int = one, q: int = two) -> tuple[float, float]:
             # Of a source at 2^-1070 some four bits are left.
-            return off(np.ldexp(wm.radiance(np.ldexp(f, p), np.ldexp(v, q)), -p - q), exact), 4 * EPS if q > -1000 else 0.1
+            return off(
+                np.ldexp(wm.radiance(np.ldexp(f, p), np.ldexp(v, q)), -p - q), exact
+            ), 4 * EPS if q > -1000 else 0.1
 
         yield Case("radiance", "F x 2^k, V x 2^l", f"{one}, {two}", scaled)
     for kind in (np.float32, np.float16):

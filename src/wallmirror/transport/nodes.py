@@ -176,7 +176,9 @@ def _extent_in_angle(observer: Observer, card: Card, half_pixel: float, half_str
         turn = _PARTS * float(np.abs(np.diff(theta_o, axis=2)).max())
         left, centre, right = (across[:, :, k] for k in (0, _PARTS // 2, _PARTS))
         pixel = max(pixel, turn + float(_fastest(sources - left, sources - right, card.distance).max()))
-        strip = max(strip, float(_fastest(sources + half_strip - centre, sources - half_strip - centre, card.distance).max()))
+        strip = max(
+            strip, float(_fastest(sources + half_strip - centre, sources - half_strip - centre, card.distance).max())
+        )
         ends = (incident_angles(sources + half_strip * node, card.distance, centre) for node in parts)
         strip = max(strip, _PARTS * max(float((right - left).max()) for left, right in itertools.pairwise(ends)))
     return pixel, strip
