@@ -7,6 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wallmirror.errors import InputError
+
 Array = NDArray[np.float64]
 
 
@@ -26,3 +28,23 @@ def power_of_two(values: ArrayLike) -> float:
     if largest == 0:
         return 1.0
     return math.ldexp(1.0, min(max(math.frexp(largest)[1], -1021), 1022))
+
+
+def rescaled(values: ArrayLike, *units: float, field: str) -> Array:
+    """Values times powers of two that they were computed in units of, without overflow on the way.
+
+    Raises
+    ------
+    InputError
+        Naming the field, if a result is not finite.
+
+    Examples
+    --------
+    >>> rescaled([3.0], 2.0**1000, 2.0**-1001, field="source")
+    array([1.5])
+    """
+    with np.errstate(over="ignore"):
+        whole = np.ldexp(np.asarray(values, dtype=np.float64), sum(math.frexp(unit)[1] - 1 for unit in units))
+    if not np.all(np.isfinite(whole)):
+        raise InputError("gives a result outside the range of float64; use other units", field=field)
+    return np.asarray(whole, dtype=np.float64)
