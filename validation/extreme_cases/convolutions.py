@@ -84,6 +84,13 @@ def form_cases() -> Iterator[Case]:
 
 FLAT = wm.Observer(position=(0.0, -5.0), fov=math.radians(60), view_angles=(0.0,), pixels=60, pixels_at="edges")
 POINTS = card(element_width=0.0, element_height=0.0)
+WIDE = lobes(10.0)
+
+
+def _train(u: mpmath.mpf, sigma_deg: float) -> mpmath.mpf:
+    """The scene's train of lobes at an angle sum."""
+    sigma = mpmath.mpf(lobes(sigma_deg).sigma)
+    return mpmath.fsum(mpmath.exp(-(((u - mpmath.mpf(c)) / sigma) ** 2) / 2) for c in lobes().centres)
 
 
 def wall_cases() -> Iterator[Case]:
@@ -94,7 +101,7 @@ def wall_cases() -> Iterator[Case]:
             def copies(m: float = metres, via: str = seen) -> tuple[float, float]:
                 eye = wm.Observer(position=(0.25 * m, -5 * m), fov=1.0, view_angles=(0.3, -0.3), pixels=5)
                 strips = wm.Card(elements_x=(-m, 0.2 * m), y=-2 * m)
-                found = wall_convolution(eye, strips, lobes(10.0), [1.0, 2.0], projected_from=via)  # type: ignore[arg-type]
+                found = wall_convolution(eye, strips, WIDE, [1.0, 2.0], projected_from=via)  # type: ignore[arg-type]
                 with mpmath.workdps(DIGITS):
                     y_o, y_s = mpmath.mpf(5 * m), mpmath.mpf(2 * m)
                     y = y_o if via == "observer" else 1 / (1 / y_o + 1 / y_s)
@@ -103,9 +110,8 @@ def wall_cases() -> Iterator[Case]:
                         for place, v in zip(strips.elements_x, (1, 2), strict=True):
                             image = (place * y_o + mpmath.mpf(eye.position[0]) * y_s) / (y_o + y_s)
                             u = -mpmath.atan((mpmath.mpf(float(x)) - image) / y)
-                            exact[a, j] += float(v * mpmath.fsum(mpmath.exp(-(((u - mpmath.mpf(c)) / mpmath.mpf(
-                                lobes(10.0).sigma)) ** 2) / 2) for c in lobes().centres))  # fmt: skip
-                return off(found, exact), 64 * EPS / lobes(10.0).sigma
+                            exact[a, j] += float(v * _train(u, 10.0))
+                return off(found, exact), 64 * EPS / WIDE.sigma
 
             yield Case("wall_convolution", "whole scene, projected from", f"x {metres:g}, {seen}", copies)
 
@@ -119,9 +125,9 @@ def wall_cases() -> Iterator[Case]:
 
         yield Case("mirror_points", "whole scene", f"x {metres:g}", image)
         yield Case("wall_kernel", "observer's distance", f"{metres:g} m", lambda m=metres: (
-            off(wall_kernel(observer(position=(0.0, -5 * m), view_angles=(0.0,), pixels=5), POINTS, lobes(10.0)),
-                wall_kernel(observer(position=(0.0, -5.0), view_angles=(0.0,), pixels=5), POINTS, lobes(10.0))),
-            64 * EPS / lobes(10.0).sigma))  # fmt: skip
+            off(wall_kernel(observer(position=(0.0, -5 * m), view_angles=(0.0,), pixels=5), POINTS, WIDE),
+                wall_kernel(observer(position=(0.0, -5.0), view_angles=(0.0,), pixels=5), POINTS, WIDE)),
+            64 * EPS / WIDE.sigma))  # fmt: skip
     yield Case("wall_kernel", "view", "turned", must_refuse(
         lambda: wall_kernel(observer(view_angles=(0.1,)), POINTS, lobes())))  # fmt: skip
     for bad in (math.nan, math.inf):
@@ -132,14 +138,14 @@ def wall_cases() -> Iterator[Case]:
 
 
 RENDERERS: dict[str, Any] = {
-    "spherical_convolution": lambda v, rho=lobes(10.0): spherical_convolution(FLAT, POINTS, rho, v, samples=200),
-    "outgoing_light": lambda v, rho=lobes(10.0): outgoing_light(FLAT, POINTS, rho, v, samples=200),
-    "angle_convolution": lambda v, rho=lobes(10.0): angle_convolution(FLAT, POINTS, rho, v, samples=200),
-    "wall_convolution": lambda v, rho=lobes(10.0): wall_convolution(FLAT, POINTS, rho, v),
+    "spherical_convolution": lambda v, rho=WIDE: spherical_convolution(FLAT, POINTS, rho, v, samples=200),
+    "outgoing_light": lambda v, rho=WIDE: outgoing_light(FLAT, POINTS, rho, v, samples=200),
+    "angle_convolution": lambda v, rho=WIDE: angle_convolution(FLAT, POINTS, rho, v, samples=200),
+    "wall_convolution": lambda v, rho=WIDE: wall_convolution(FLAT, POINTS, rho, v),
     "mirror_render": lambda v, rho=None: mirror_render(FLAT, POINTS, v),
     "box_mirror_render": lambda v, rho=None: box_mirror_render(FLAT, POINTS, v, width=0.05),
-    "nearest_spherical": lambda v, rho=lobes(10.0): nearest_spherical(FLAT, POINTS, rho, v),
-    "scattered_wall_convolution": lambda v, rho=lobes(10.0): scattered_wall_convolution(FLAT, POINTS, rho, v),
+    "nearest_spherical": lambda v, rho=WIDE: nearest_spherical(FLAT, POINTS, rho, v),
+    "scattered_wall_convolution": lambda v, rho=WIDE: scattered_wall_convolution(FLAT, POINTS, rho, v),
 }
 
 
@@ -172,7 +178,7 @@ def scaling_cases() -> Iterator[Case]:
         yield Case(name, "BRDF", "a mirror", must_refuse(lambda c=call: c(v, wm.Mirror())))
 
     def directions() -> tuple[float, float]:
-        found = outgoing_light(FLAT, POINTS, lobes(10.0), v, samples=400, weights="cosine")
+        found = outgoing_light(FLAT, POINTS, WIDE, v, samples=400, weights="cosine")
         with mpmath.workdps(DIGITS):
             exact = np.zeros((5, 7))
             rows, columns = np.linspace(0, 59, 5).astype(int), np.linspace(0, 399, 7).astype(int)
@@ -181,9 +187,9 @@ def scaling_cases() -> Iterator[Case]:
                 for c, k in enumerate(columns):
                     theta = mpmath.mpf(float(half_circle_directions(400)[k]))
                     for place, strength in zip(POINTS.elements_x, v, strict=True):
-                        s = mpmath.atan2(place - x, 1)
-                        exact[r, c] += float(float(strength) * mpmath.cos(s) * mpmath.fsum(mpmath.exp(-(((s + theta - mpmath.mpf(
-                            centre)) / mpmath.mpf(lobes(10.0).sigma)) ** 2) / 2) for centre in lobes().centres))  # fmt: skip
+                        sum_ = mpmath.atan2(place - x, 1) + theta
+                        cosine = mpmath.cos(mpmath.atan2(place - x, 1))
+                        exact[r, c] += float(float(strength) * cosine * _train(sum_, 10.0))
         # Cubic splines of a step of 0.45 deg under lobes of 10 deg: (h / sigma)^4 / 384 twice, and their derivatives.
         return off(found[0][np.ix_(rows, columns)], exact), 1e-6
 
@@ -299,7 +305,8 @@ def half_circle_cases() -> Iterator[Case]:
 
         yield Case("HalfCircle", "samples, order: adjoint", f"{samples}, {order}", adjoint)
     fields: tuple[dict[str, Any], ...] = (
-        {"samples": 0}, {"samples": 1}, {"samples": 2.5}, {"samples": math.nan}, {"samples": 10**13}, {"samples": 10, "order": 10},
+        {"samples": 0}, {"samples": 1}, {"samples": 2.5}, {"samples": math.nan}, {"samples": 10**13},
+        {"samples": 10, "order": 10},
         {"samples": 10, "order": -1}, {"samples": 10, "order": 1.5},
     )  # fmt: skip
     for given in fields:
@@ -310,7 +317,7 @@ def half_circle_cases() -> Iterator[Case]:
         yield Case("HalfCircle.weights", "angle", f"{bad}", must_refuse(lambda v=bad: grid.weights([v])))
         yield Case("HalfCircle.spread", "strength", f"{bad}", must_refuse(lambda v=bad: grid.spread([0.0], [v])))
         yield Case("HalfCircle.outgoing", "map", f"{bad}", must_refuse(
-            lambda v=bad: grid.outgoing(np.full(200, v), lobes(10.0))))  # fmt: skip
+            lambda v=bad: grid.outgoing(np.full(200, v), WIDE)))  # fmt: skip
         yield Case(
             "HalfCircle.read", "coefficients", f"{bad}", must_refuse(lambda v=bad: grid.read(np.full(200, v), [0.0]))
         )
@@ -338,8 +345,8 @@ def hypothesis_cases() -> Iterator[Case]:
     for power in (-900, 900):
 
         def errors(p: int = power) -> tuple[float, float]:
-            plain = convolution_errors(FLAT, POINTS, lobes(10.0), np.array([0.3, 1.0, 0.5]), samples=200)
-            scaled = convolution_errors(FLAT, POINTS, lobes(10.0), np.ldexp([0.3, 1.0, 0.5], p), samples=200)
+            plain = convolution_errors(FLAT, POINTS, WIDE, np.array([0.3, 1.0, 0.5]), samples=200)
+            scaled = convolution_errors(FLAT, POINTS, WIDE, np.ldexp([0.3, 1.0, 0.5], p), samples=200)
             return max(abs(plain[name] - scaled[name]) for name in plain), 0.0
 
         yield Case("convolution_errors", "V x 2^k", f"k = {power}", errors)

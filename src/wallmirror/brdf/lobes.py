@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -207,7 +208,7 @@ class GaussianTrain(AngleSumBRDF):
         if not (math.isfinite(self.sigma) and self.sigma > 0):
             raise InputError(f"is {math.degrees(self.sigma):g}; give a width > 0", field="wall.sigma_deg")
         require_choice("wall.height", self.height, get_args(LobeHeight))
-        require_range("wall.scale", self.scale, 0, math.inf)
+        require_range("wall.scale", self.scale, 0, sys.float_info.max)
         if not math.isfinite(self._peak()):
             raise InputError(f"is {math.degrees(self.sigma):g}, too narrow for a finite height", field="wall.sigma_deg")
         if not math.isfinite(self._peak() * len(self.centres)):
