@@ -15,14 +15,40 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
-from extreme_cases import brdfs, convolutions, geometry, invariances, rendering, solving, transport
+from extreme_cases import (
+    blind,
+    bounces,
+    brdfs,
+    convolutions,
+    deconvolution,
+    geometry,
+    invariances,
+    kernels,
+    rendering,
+    solving,
+    tables,
+    transport,
+)
 from extreme_cases.harness import Case, Cell, run
 
 from wallmirror.files import write_atomically
 
 HERE = Path(__file__).parent
 #: The topics, in the order of the page.
-TOPICS = (geometry, brdfs, transport, convolutions, solving, invariances, rendering)
+TOPICS = (
+    geometry,
+    brdfs,
+    tables,
+    transport,
+    kernels,
+    bounces,
+    convolutions,
+    deconvolution,
+    blind,
+    solving,
+    invariances,
+    rendering,
+)
 
 
 def all_cases() -> list[Case]:

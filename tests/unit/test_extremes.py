@@ -6,9 +6,11 @@ import importlib
 import math
 import sys
 import warnings
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,29 +18,137 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import wallmirror as wm
+from wallmirror.deconvolution import Convolution
 
 from .helpers import same_examples
 
 _VALIDATION = Path(__file__).parents[2] / "validation"
 
 
-def _topics() -> tuple[ModuleType, ...]:
+def _topics(*names: str) -> tuple[ModuleType, ...]:
     sys.path.insert(0, str(_VALIDATION))
     try:
-        names = ("harness", "scenes", "geometry", "brdfs", "transport", "solving", "invariances")
         return tuple(importlib.import_module(f"extreme_cases.{name}") for name in names)
     finally:
         sys.path.remove(str(_VALIDATION))
 
 
-harness, scenes, geometry, brdfs, transport, solving, invariances = _topics()
-QUICK = [*geometry.cases(), *brdfs.cases(), *transport.strip_cases(), *invariances.cases()]
+harness, scenes, geometry, brdfs, tables, transport = _topics(
+    "harness", "scenes", "geometry", "brdfs", "tables", "transport"
+)
+kernels, bounces, convolutions = _topics("kernels", "bounces", "convolutions")
+deconvolution, blind, solving, invariances = _topics("deconvolution", "blind", "solving", "invariances")
+
+#: The groups of cells that take at most a second or two.
+QUICK = (
+    geometry.cases,
+    brdfs.cases,
+    tables.cases,
+    transport.strip_cases,
+    kernels.two_angle_cases,
+    kernels.option_cases,
+    kernels.mirror_cases,
+    kernels.product_cases,
+    bounces.factor_cases,
+    bounces.series_cases,
+    bounces.card_cases,
+    convolutions.cases,
+    deconvolution.cases,
+    blind.cases,
+    invariances.cases,
+)
 
 
-@pytest.mark.parametrize("case", QUICK, ids=lambda c: f"{c.entry}, {c.quantity}, {c.value}")
-def test_no_quick_cell_is_a_fault(case):
-    cell = harness.run(case)
-    assert cell.outcome in ("right", "refused"), cell.words
+def _faults(cases: Iterable[Any], entry: str = "", quantity: str = "", value: str = "") -> list[str]:
+    """The faults among cells whose names begin so; at least one cell has to."""
+    asked = [
+        c for c in cases if c.entry.startswith(entry) and c.quantity.startswith(quantity) and c.value.startswith(value)
+    ]
+    assert asked
+    cells = [harness.run(case) for case in asked]
+    return [f"{c.entry}, {c.quantity}, {c.value}: {c.words}" for c in cells if c.outcome not in ("right", "refused")]
+
+
+@pytest.mark.parametrize("cases", QUICK, ids=lambda c: f"{c.__module__.rsplit('.', 1)[-1]}.{c.__name__}")
+def test_no_quick_cell_is_a_fault(cases):
+    assert _faults(cases()) == []
+
+
+def _lgamma_quotient(a: float) -> float:
+    return math.exp(math.lgamma(a) + math.lgamma(0.5) - math.lgamma(a + 0.5))
+
+
+def _no_unit(*_: Any) -> float:
+    return 1.0
+
+
+def _unchanged(values: Any, *_: Any, **__: Any) -> Any:
+    return values
+
+
+#: A fault planted in a function, and the cells that must show it.
+PLANTED = {
+    "log gammas of a large exponent": (
+        "brdf.lobes._beta_half", _lgamma_quotient,
+        brdfs.lobe_cases, "Phong", "exponent", "1e+08"),
+    "a rounded cosine to the power of n": (
+        "brdf.lobes._power_of_cosine", lambda u, n: np.cos(u) ** n,
+        brdfs.lobe_cases, "Blinn", "exponent", "1e+08"),
+    "a difference that cancels near index 1": (
+        "brdf.microfacet._contrast", lambda a, b, _: (a - b) / (a + b),
+        brdfs.fresnel_cases, "Fresnel", "eta, k", "1.000000001, 0"),
+    "slopes of a table at 1e300": (
+        "brdf.tables.power_of_two", _no_unit,
+        tables.table_cases, "AngleSumTable", "value", "1e+300, 0"),
+    "a peak below a near card": (
+        "transport.nodes._fastest", lambda one, *_: np.zeros_like(one),
+        kernels.kernel_cases, "build_kernel, physical", "card's", "0.01"),
+    "lengths in metres to the fourth power": (
+        "interreflection.power_of_two", _no_unit,
+        bounces.card_cases, "glow_in_mirror", "scene x 2^k", "k = -300"),
+    "places rounded to 1e-12 m": (
+        "interreflection.power_of_two", _no_unit,
+        bounces.card_cases, "from_card", "scene x 2^k", "k = -20"),
+    "renders of 1e300": (
+        "convolution.spherical.power_of_two", _no_unit,
+        convolutions.scaling_cases, "wall_convolution", "V, rho"),
+    "squares of a render": (
+        "convolution.hypotheses.power_of_two", _no_unit,
+        convolutions.hypothesis_cases, "relative_error", "both", "k = -900"),
+    "squares of the data": (
+        "deconvolution.checking.power_of_two", _no_unit,
+        deconvolution.richardson_lucy_cases, "richardson_lucy", "one", "1e+300"),
+    "squares of the truth": (
+        "deconvolution.checking.power_of_two", _no_unit,
+        deconvolution.align_cases, "align", "estimate x", "-900, 0"),
+    "norms that underflow": (
+        "deconvolution.checking.power_of_two", _no_unit,
+        deconvolution.choice_cases, "Spectrum norms", "alpha", "1, 1e-300"),
+    "sources in a unit of their own": (
+        "deconvolution.cross_relation.rescaled", _unchanged,
+        blind.multichannel_cases, "identify_channels", "g x", "k = 900"),
+    "a source in a unit of its own": (
+        "deconvolution.least_squares_blind.rescaled", _unchanged,
+        blind.multichannel_cases, "least_squares_blind", "g x", "k = 900"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", PLANTED)
+def test_the_table_shows_a_planted_fault(fault, monkeypatch):
+    name, wrong, cases, *cells = PLANTED[fault]
+    assert _faults(cases(), *cells) == []
+    module, function = name.rsplit(".", 1)
+    monkeypatch.setattr(importlib.import_module(f"wallmirror.{module}"), function, wrong)
+    assert _faults(cases(), *cells)
+
+
+def test_the_table_shows_an_adjoint_that_convolves(monkeypatch):
+    def forward_again(self, data):
+        return np.resize(self._forward(data[: self._taken_shape[0]]), self._taken_shape)
+
+    monkeypatch.setattr(Convolution, "_backward", forward_again)
+    assert _faults(deconvolution.operator_cases(), "toeplitz_matrix, Convolution.adjoint", "same")
+    assert _faults(deconvolution.operator_cases(), "adjoint_mismatch", "same", "(1000,)")
 
 
 @pytest.mark.parametrize("intensity", ["1e-300", "1e+300", "denormal (1e-310)"])

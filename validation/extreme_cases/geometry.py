@@ -135,6 +135,10 @@ def field_cases() -> Iterator[Case]:
     )  # fmt: skip
     for changes in cards:
         yield Case("Card", *_told(changes), must_refuse(lambda c=changes: card(**c)))
+    for value in (0.0, -1.0, math.nan, math.inf, 1e101):
+        for name in ("half_width", "half_height"):
+            yield Case("Wall", name, f"{value:g}", must_refuse(
+                lambda n=name, v=value: wm.Wall(brdf=wm.Diffuse(), **{n: v})))  # fmt: skip
 
 
 def _told(changes: dict[str, Any]) -> tuple[str, str]:
