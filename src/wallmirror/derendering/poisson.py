@@ -222,9 +222,12 @@ def _least_squares(data: _Counts, r: Array) -> Array:
 def _fit(
     data: _Counts, r: Array, v: Array, mean: Array, least: float, gain: float, iterations: int, *, converged: bool
 ) -> PoissonFit:
-    pearson = float(np.sum((data.counts - mean) ** 2 * data.weights(mean, least)))
-    freedom = int(np.count_nonzero(data.used)) - int(np.count_nonzero(r)) - int(np.count_nonzero(v)) + 1
-    return PoissonFit(r, v, gain, pearson / max(1, freedom), iterations, converged)
+    weights = data.weights(mean, least)
+    pearson = float(np.sum((data.counts - mean) ** 2 * weights))
+    # A pixel in which hardly any light is expected adds hardly anything to the sum, and frees no more.
+    expected = float(np.sum(np.maximum(mean, 0.0) * weights))
+    freedom = expected - int(np.count_nonzero(r)) - int(np.count_nonzero(v)) + 1
+    return PoissonFit(r, v, gain, pearson / max(1.0, freedom), iterations, converged)
 
 
 def _scoring_step(
