@@ -16,6 +16,7 @@ from wallmirror.derendering.problem import (
     Problem,
     patterns_space,
     prepare,
+    require_pixels,
     require_realisations,
     too_few_patterns,
 )
@@ -69,6 +70,7 @@ class Stack:
         inverse = None
         if any(p.inverse_variance is not None for p in parts):
             inverse = np.concatenate([_weights(p, ratio, stated) for p, ratio in zip(parts, ratios, strict=True)])
+            require_pixels(inverse, captures[0].card.elements)
         noisy = np.concatenate([p.noisy for p in parts])
         problem = Problem(captures[0], data, inverse, noisy, stated, scale)
         space, _ = patterns_space(problem)

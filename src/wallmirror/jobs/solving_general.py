@@ -41,6 +41,8 @@ class GeneralSolved:
         s = self.solution
         return {
             "status": s.status,
+            "verdict": s.verdict,
+            "warnings": list(s.warnings),
             "method": s.method,
             "positions": [list(c.observer.position) for c in self.captures],
             "reciprocal": s.brdf.grid.reciprocal,
@@ -136,7 +138,7 @@ def _write(out: Path, solved: GeneralSolved) -> None:
 def _verdicts(solved: GeneralSolved) -> list[Verdict]:
     s, error = solved.solution, solved.source_error
     if error is None:
-        return [Verdict(True, "The captures determine pattern and table.")]
+        return [Verdict(not s.warnings, s.status if s.warnings else "The captures determine pattern and table.")]
     return [
         Verdict(
             error <= 2 * s.predicted_error,
