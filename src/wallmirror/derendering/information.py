@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from wallmirror.derendering.convex import minimise_above
 from wallmirror.derendering.moments import Moments
+from wallmirror.errors import UndeterminedError
 
 Array = NDArray[np.float64]
 
@@ -105,10 +106,21 @@ def mixed(data: Moments, point: Point, other: Array) -> Array:
     return total
 
 
+def unseen_pattern() -> UndeterminedError:
+    """The refusal of captures of which one leaves its pattern free, as no light of the card falls on a pixel that counts."""
+    return UndeterminedError(
+        "in one realisation the pixels that are not saturated see no light of the card, so that nothing determines its "
+        "pattern; leave it out, or expose for less time and capture it again"
+    )
+
+
 def inverses(data: Moments, point: Point, free: NDArray[np.bool_]) -> Array:
-    """H_b^-1 with the rows and columns of fixed source entries zero, shape (B, M, M)."""
+    """H_b^-1 with the rows and columns of fixed source entries zero, shape (B, M, M); UndeterminedError where one is zero."""
     m = data.elements
-    ridge = 1e-14 * np.trace(point.normal, axis1=1, axis2=2)[:, None, None] * np.eye(m)
+    trace = np.trace(point.normal, axis1=1, axis2=2)
+    if not np.all(trace > 0):
+        raise unseen_pattern()
+    ridge = 1e-14 * trace[:, None, None] * np.eye(m)
     inverse = np.linalg.inv(point.normal + ridge + 1e-300 * np.eye(m))[data.group]
     for b in np.flatnonzero(~np.all(free, axis=1)):
         both = free[b, :, None] & free[b]

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.angle_sum_check import check_angle_sum, fit_facets, with_doubt
 from wallmirror.derendering.calibration import Calibration
-from wallmirror.derendering.counting import solve_counts, with_counting_noise
+from wallmirror.derendering.counting import prepare_counts, solve_counts
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.exact import solve_exactly
 from wallmirror.derendering.knots import NOISY_STEPS
@@ -150,12 +150,13 @@ def solve(
         if progress is not None:
             progress(stage)
 
-    if method == "poisson":
-        assert counts_per_radiance is not None
-        captures = with_counting_noise(captures, per_radiance=counts_per_radiance, background=background)
     # The matrices are small: two BLAS threads that wait for each other are up to a hundred times slower than one.
     with threadpool_limits(limits=1, user_api="blas"):
-        problem, space = prepare(captures, few_captures=few, weak_patterns=method != "closed_form")
+        if method == "poisson":
+            assert counts_per_radiance is not None
+            problem, space = prepare_counts(captures, per_radiance=counts_per_radiance, background=background)
+        else:
+            problem, space = prepare(captures, few_captures=few, weak_patterns=method != "closed_form")
 
         def fit(problem: Problem) -> Estimate:
             if method != "poisson":
