@@ -23,11 +23,14 @@ from wallmirror.derendering.groups import Groups
 from wallmirror.derendering.information import Information, information
 from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.splines import SplineGrid
+from wallmirror.errors import InputError
 
 Array = NDArray[np.float64]
 
 # Share of a bound on V that a ten times larger ridge must leave.
 _KEPT = 0.8
+# The largest entry of a pattern must lie between these.
+_LEAST, _MOST = 1e-50, 1e50
 
 
 @dataclass(frozen=True)
@@ -78,8 +81,21 @@ def cramer_rao(data: Moments, coefficients: Array, source: Array, *, gauge: Arra
         V, shape (M, B).
     gauge:
         c, shape (K,): the values of the basis functions at the peak of rho.
+
+    Raises
+    ------
+    InputError
+        For a pattern whose powers leave the range of float64.
     """
+    require_order_one(source)
     return bound_of(information(data, coefficients, source), coefficients=coefficients, source=source, gauge=gauge)
+
+
+def require_order_one(source: Array) -> None:
+    """Refuse a pattern whose squares, weighted, float64 cannot hold."""
+    largest = float(np.max(np.abs(source), initial=0.0))
+    if not _LEAST <= largest <= _MOST:
+        raise InputError(f"is {largest:g} at most; bring it near one, and the noise along", field="source")
 
 
 def bound_of(

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from wallmirror.derendering.bounds import Bound, bound_of
+from wallmirror.derendering.bounds import Bound, bound_of, require_order_one
 from wallmirror.derendering.convex import minimise_above, solve_positive
 from wallmirror.derendering.information import Information
 from wallmirror.derendering.poisson_information import Products, information_of_counts, seen_cells, transport_of
@@ -185,7 +185,13 @@ def poisson_bound(
         c, shape (K,): the values of the basis functions at the peak of rho.
     background:
         Known mean of the counts without the card, broadcast to (P, B).
+
+    Raises
+    ------
+    InputError
+        For a background below zero, or a pattern whose powers leave the range of float64.
     """
+    require_order_one(source)
     shape = (designs[0].shape[0], source.shape[1])
     data = _checked(np.zeros(shape), designs, background, used)
     seen = seen_cells(designs)
