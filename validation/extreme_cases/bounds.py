@@ -52,10 +52,15 @@ def exact_bound(
         rows = []
         information = mp.zeros(unknowns + 1)
         for p in range(t[0].shape[0]):
-            f = [mp.fsum(mp.mpf(float(t[i][p, k])) * mp.mpf(float(r[k])) for k in range(r.size)) for i in range(elements)]
+            f = [
+                mp.fsum(mp.mpf(float(t[i][p, k])) * mp.mpf(float(r[k])) for k in range(r.size)) for i in range(elements)
+            ]
             for b in range(realisations):
                 mean = mp.fsum(f[i] * mp.mpf(float(v[i, b])) for i in range(elements))
-                slope = {k: mp.fsum(mp.mpf(float(t[i][p, k])) * mp.mpf(float(v[i, b])) for i in range(elements)) for k in range(r.size)}
+                slope = {
+                    k: mp.fsum(mp.mpf(float(t[i][p, k])) * mp.mpf(float(v[i, b])) for i in range(elements))
+                    for k in range(r.size)
+                }
                 slope.update({r.size + i * realisations + b: f[i] for i in range(elements)})
                 rows.append((slope, weights(p, b, mean)))
         for slope, weight in rows:
@@ -68,7 +73,9 @@ def exact_bound(
         at = range(r.size, unknowns)
         power = mp.fsum(mp.mpf(float(x)) ** 2 for x in v.ravel())
         flat = [mp.mpf(float(x)) for x in v.ravel()]
-        along = mp.fsum(flat[i] * covariance[r.size + i, r.size + j] * flat[j] for i in range(v.size) for j in range(v.size))
+        along = mp.fsum(
+            flat[i] * covariance[r.size + i, r.size + j] * flat[j] for i in range(v.size) for j in range(v.size)
+        )
         total = mp.fsum(covariance[i, i] for i in at)
         error = mp.sqrt((total - along / power) / power)
         return np.array([mp.sqrt(covariance[i, i]) for i in at], dtype=object).reshape(v.shape), error
@@ -89,7 +96,14 @@ def _relative(found: float, exact: Any) -> float:
 _ALLOWED = 1e-6
 
 
-def normal_bound(*, light: float = 1.0, weight: float = 1.0, one_pixel: float | None = None, elements: int = _M, realisations: int = _B) -> tuple[float, float]:
+def normal_bound(
+    *,
+    light: float = 1.0,
+    weight: float = 1.0,
+    one_pixel: float | None = None,
+    elements: int = _M,
+    realisations: int = _B,
+) -> tuple[float, float]:
     designs, r, v, gauge = small_problem(elements, realisations)
     v = v * light
     weights = np.full((_P, realisations), weight)
@@ -110,13 +124,25 @@ def counting_bound(*, counts: float, background: float = 0.0) -> tuple[float, fl
 
 
 def foreseen(*, light: float = 1.0, noise: float = 1e-3, changes: dict[str, Any] | None = None) -> wm.Forecast:
-    given = {"observer": observer(), "card": card(element_width=0.0, element_height=0.0), "source": np.eye(3), **(changes or {})}
+    given = {
+        "observer": observer(),
+        "card": card(element_width=0.0, element_height=0.0),
+        "source": np.eye(3),
+        **(changes or {}),
+    }
     source = light * np.asarray(given["source"])
     return wm.foresee(given["observer"], given["card"], lobes(), source, noise=noise, weights="cosine")
 
 
 def forecast_cases() -> Iterator[Case]:
-    for light, noise in ((1e-300, 1e-303), (1e300, 1e297), (1e-150, 1e150), (1e300, 1e-300), (1.0, 1e-320), (1e-320, 1.0)):
+    for light, noise in (
+        (1e-300, 1e-303),
+        (1e300, 1e297),
+        (1e-150, 1e150),
+        (1e300, 1e-300),
+        (1.0, 1e-320),
+        (1e-320, 1.0),
+    ):
 
         def scaled(v: float = light, n: float = noise) -> tuple[float, float]:
             plain, found = foreseen(noise=1e-3), foreseen(light=v, noise=n)
@@ -139,7 +165,14 @@ def forecast_cases() -> Iterator[Case]:
         def one_entry(v: float = value) -> wm.Forecast:
             noise = np.full((3, 60, 3), 1e-3)
             noise[1, 30, 1] = v
-            return wm.foresee(observer(), card(element_width=0.0, element_height=0.0), lobes(), np.eye(3), noise=noise, weights="cosine")  # type: ignore[arg-type]
+            return wm.foresee(
+                observer(),
+                card(element_width=0.0, element_height=0.0),
+                lobes(),
+                np.eye(3),
+                noise=noise,
+                weights="cosine",
+            )  # type: ignore[arg-type]
 
         yield Case("foresee", "noise of one pixel", f"{value:g}", refused(one_entry))
     for value in (1e-300, 1e300):
@@ -147,14 +180,26 @@ def forecast_cases() -> Iterator[Case]:
         def spotted(v: float = value) -> tuple[float, float]:
             noise = np.full((3, 60, 3), 1e-3)
             noise[1, 30, 1] = v
-            found = wm.foresee(observer(), card(element_width=0.0, element_height=0.0), lobes(), np.eye(3), noise=noise, weights="cosine")
+            found = wm.foresee(
+                observer(),
+                card(element_width=0.0, element_height=0.0),
+                lobes(),
+                np.eye(3),
+                noise=noise,
+                weights="cosine",
+            )
             plain = foreseen(noise=1e-3)
             # One pixel of 540 that knows nothing, or all: it cannot move the bound by more than a few of its shares.
             return abs(found.source_error / plain.source_error - 1), 0.05
 
         yield Case("foresee", "noise of one pixel", f"{value:g}", spotted)
     for value in (0.0, math.nan, math.inf):
-        yield Case("foresee", "pattern", f"{value:g}", refused(lambda v=value: foreseen(changes={"source": np.full((3, 3), v)})))
+        yield Case(
+            "foresee",
+            "pattern",
+            f"{value:g}",
+            refused(lambda v=value: foreseen(changes={"source": np.full((3, 3), v)})),
+        )
     for step in (0.0, -1.0, math.nan, math.inf):
 
         def stepped(v: float = step) -> wm.Forecast:
@@ -172,7 +217,9 @@ def forecast_cases() -> Iterator[Case]:
         ("patterns", "one element dark", {"source": np.diag([1.0, 0.0, 1.0])}),
     ):
 
-        def hopeless(c: dict[str, Any] = changes, may: bool = quantity in ("elements M", "realisations B", "patterns")) -> tuple[float, float]:
+        def hopeless(
+            c: dict[str, Any] = changes, may: bool = quantity in ("elements M", "realisations B", "patterns")
+        ) -> tuple[float, float]:
             found = foreseen(changes=c)
             if math.isnan(found.source_error) or math.isnan(found.transport_error) or np.any(np.isnan(found.shape_std)):
                 return math.nan, 0.0
@@ -206,5 +253,10 @@ def cases() -> Iterator[Case]:
     for counts in (1e-300, 1e-49, 1e-6, 1.0, 1e6, 1e15, 1e49, 1e300):
         yield Case("poisson_bound", "counts", f"{counts:g}", lambda c=counts: counting_bound(counts=c))
     for background in (1e-300, 1.0, 1e6, 1e300):
-        yield Case("poisson_bound", "background", f"{background:g}", lambda c=background: counting_bound(counts=10.0, background=c))
+        yield Case(
+            "poisson_bound",
+            "background",
+            f"{background:g}",
+            lambda c=background: counting_bound(counts=10.0, background=c),
+        )
     yield from forecast_cases()

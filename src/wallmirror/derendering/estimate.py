@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from wallmirror.derendering.information import Information
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm
+from wallmirror.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -82,6 +84,13 @@ def doubts_of_fit(*, converged: bool, misfit: float | None) -> list[str]:
 def scale_free_error(estimate: Array, truth: Array, groups: tuple[tuple[int, ...], ...] = ()) -> float:
     """Relative Frobenius error after the best global scale of the estimate, or the best one of each group of its rows.
 
+    It is inf where the truth is all 0.
+
+    Raises
+    ------
+    InputError
+        For arrays of different shapes, and values that are not finite.
+
     Examples
     --------
     >>> scale_free_error(np.array([2.0, 4.0]), np.array([1.0, 2.0]))
@@ -89,14 +98,23 @@ def scale_free_error(estimate: Array, truth: Array, groups: tuple[tuple[int, ...
     >>> scale_free_error(np.array([[2.0], [9.0]]), np.array([[1.0], [3.0]]), groups=((0,), (1,)))
     0.0
     """
+    arrays = {"estimate": np.asarray(estimate, dtype=np.float64), "truth": np.asarray(truth, dtype=np.float64)}
+    for name, values in arrays.items():
+        if not np.all(np.isfinite(values)):
+            raise InputError("holds a value that is not finite", field=name)
+    if arrays["estimate"].shape != arrays["truth"].shape:
+        raise InputError(f"has shape {arrays['estimate'].shape}; give {arrays['truth'].shape}", field="estimate")
+    if not np.any(arrays["truth"]):
+        return math.inf
     # In units of the largest entry each, so that squares neither overflow nor vanish.
-    found, sought = (
-        np.asarray(values) / (float(np.max(np.abs(values), initial=0.0)) or 1.0) for values in (estimate, truth)
-    )
-    if groups:
-        parts = [list(group) for group in groups]
-        missed = [scale_free_error(found[i], sought[i]) * float(np.linalg.norm(sought[i])) for i in parts]
-        return float(np.linalg.norm(missed) / np.linalg.norm(sought))
+    found, sought = (values / (float(np.max(np.abs(values))) or 1.0) for values in arrays.values())
+    parts = [list(group) for group in groups] or [slice(None)]
+    missed = [_missed(found[part], sought[part]) for part in parts]
+    return float(np.linalg.norm(missed) / np.linalg.norm(sought))
+
+
+def _missed(found: Array, sought: Array) -> float:
+    """Frobenius norm of what the best multiple of an array leaves of another."""
     power = float(np.sum(found * found))
     scale = float(np.sum(found * sought)) / power if power > 0 else 0.0
-    return float(np.linalg.norm(scale * found - sought) / np.linalg.norm(sought))
+    return float(np.linalg.norm(scale * found - sought))

@@ -132,14 +132,15 @@ def solve_directory(
 
 
 def judge(solution: Solution, truth: Truth | None) -> Judgement | None:
-    """Compare a solution with the truth of a rendered capture set; None where there is no truth."""
-    if truth is None or truth.source.shape != solution.source.shape:
+    """Compare a solution with the truth of a rendered capture set; None where there is no truth, or a dark one."""
+    if truth is None or truth.source.shape != solution.source.shape or not np.any(truth.source):
         return None
     rho = true_brdf(solution, truth)
     brdf_error = math.nan
     if rho is not None and solution.components == 1:
         seen = well_seen(solution)
-        brdf_error = scale_free_error(solution.brdf[seen], rho[seen])
+        if np.any(rho[seen]):
+            brdf_error = scale_free_error(solution.brdf[seen], rho[seen])
     return Judgement(scale_free_error(solution.source, truth.source, solution.groups), brdf_error)
 
 

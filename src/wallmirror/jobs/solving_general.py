@@ -84,7 +84,8 @@ def solve_directories(
     captures = tuple(read_captures(directory) for directory in directories)
     solution = solve_general(captures, reciprocal=reciprocal, step_deg=step_deg, progress=progress)
     known = read_truth(directories[0])
-    truth = known.source if known is not None and known.source.shape == solution.source.shape else None
+    fits = known is not None and known.source.shape == solution.source.shape and bool(np.any(known.source))
+    truth = known.source if known is not None and fits else None
     error = None if truth is None else scale_free_error(solution.source, truth)
     solved = GeneralSolved(captures, solution, truth, error)
     _write(out, solved)
