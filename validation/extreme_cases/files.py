@@ -51,7 +51,9 @@ def rounded(values: Array) -> Array:
 
 
 def small_set(films: Array, variance: Array | None = None, **changes: Any) -> wm.CaptureSet:
-    eye = changes.pop("observer", None) or observer(pixels=films.shape[1], view_angles=tuple(np.linspace(0.2, -0.2, films.shape[0])))
+    eye = changes.pop("observer", None) or observer(
+        pixels=films.shape[1], view_angles=tuple(np.linspace(0.2, -0.2, films.shape[0]))
+    )
     return wm.CaptureSet(observer=eye, card=changes.pop("card", card()), radiance=films, variance=variance, **changes)
 
 
@@ -114,11 +116,15 @@ def capture_cases() -> Iterator[Case]:
     for metres in (1e-100, 1e-6, 1e8, 1e99):
         points = {"element_width": 0.0, "element_height": 0.0}
         yield Case(entry, "card's distance", f"{metres:g} m", lambda m=metres: geometry({}, {"y": -m, **points}))
-        yield Case(entry, "observer's distance", f"{metres:g} m", lambda m=metres: geometry({"position": (0.1, -m)}, {}))
+        yield Case(
+            entry, "observer's distance", f"{metres:g} m", lambda m=metres: geometry({"position": (0.1, -m)}, {})
+        )
     for angle in (0.0, 1e-300, 1e-8, 0.7, -0.7):
         yield Case(entry, "view angle", f"{angle:g} rad", lambda a=angle: geometry({"view_angles": (a,)}, {}))
     for angle in (1e-5, 1.0, 3.0):
-        yield Case(entry, "field of view", f"{angle:g} rad", lambda a=angle: geometry({"fov": a, "view_angles": (0.0,)}, {}))
+        yield Case(
+            entry, "field of view", f"{angle:g} rad", lambda a=angle: geometry({"fov": a, "view_angles": (0.0,)}, {})
+        )
     for angle in (0.0, 5e-324, 1e-300, 1e-8, math.pi / 2, -1.2):
         yield Case("exact_degrees", "angle", f"{angle:g} rad", lambda a=angle: (
             abs(math.radians(exact_degrees(a)) - a) / (abs(a) or 1.0), 2.3e-16 if abs(a) > 1e-300 else 1.0))  # fmt: skip
@@ -166,7 +172,9 @@ def truth_cases() -> Iterator[Case]:
             wm.write_captures(at / "set", small_set(np.ones((1, 2, 1))), truth=given)
             found = wm.read_truth(at / "set")
         assert found is not None
-        return (0.0 if np.array_equal(found.source, given.source) and np.array_equal(found.brdf, given.brdf) else 1.0), 0.0
+        return (
+            0.0 if np.array_equal(found.source, given.source) and np.array_equal(found.brdf, given.brdf) else 1.0
+        ), 0.0
 
     for value in (0.0, -1.0, 5e-324, 1e-300, 0.1, 1.7976931348623157e308):
         yield Case("write_captures, read_truth", "numbers", f"{value:g}", answered(lambda v=value: kept(v)))
@@ -192,14 +200,46 @@ def truth_cases() -> Iterator[Case]:
 
 _SCENE: dict[str, dict[str, Any]] = {
     "": {"format": 1, "title": '"t"'},
-    "wall": {"brdf": '"gaussian_train"', "centres_deg": "[0.0]", "sigma_deg": 5.0, "scale": 1.0, "half_width": 50.0, "half_height": 50.0, "diffuse_albedo": 0.1},
+    "wall": {
+        "brdf": '"gaussian_train"',
+        "centres_deg": "[0.0]",
+        "sigma_deg": 5.0,
+        "scale": 1.0,
+        "half_width": 50.0,
+        "half_height": 50.0,
+        "diffuse_albedo": 0.1,
+    },
     "observer": {"position": "[0.0, -5.0]", "fov_deg": 40.0, "view_angles_deg": "[5.0]", "pixels": 8},
-    "card": {"elements_x": "[-0.5, 0.5]", "y": -1.0, "element_width": 0.02, "element_height": 0.03, "albedo": 0.1, "board_width": 2.0, "board_height": 1.0},
+    "card": {
+        "elements_x": "[-0.5, 0.5]",
+        "y": -1.0,
+        "element_width": 0.02,
+        "element_height": 0.03,
+        "albedo": 0.1,
+        "board_width": 2.0,
+        "board_height": 1.0,
+    },
     "source": {"level": 1.0, "realisations": 2, "seed": 1},
     "room": {"half_width": 10.0, "half_height": 10.0, "depth": 20.0, "albedo": 0.5},
     "render": {"max_depth": 4, "spp": 16, "rr_depth": 5},
 }
-_VALUES = ("0", "-1", "1e-300", "1e300", "-1e300", "inf", "-inf", "nan", "1e400", '"1"', "true", "[]", "{}", "[nan]", "1" * 400)
+_VALUES = (
+    "0",
+    "-1",
+    "1e-300",
+    "1e300",
+    "-1e300",
+    "inf",
+    "-inf",
+    "nan",
+    "1e400",
+    '"1"',
+    "true",
+    "[]",
+    "{}",
+    "[nan]",
+    "1" * 400,
+)
 
 
 def scene_text(table: str, name: str, value: str) -> str:
@@ -218,7 +258,13 @@ def loaded(text: str) -> wm.Scene:
 
 def kept_value(scene: wm.Scene, table: str, name: str) -> Any:
     """What became of a field."""
-    at = {"wall": scene.wall, "observer": scene.observer, "card": scene.card, "room": scene.room, "render": scene.render}.get(table)
+    at = {
+        "wall": scene.wall,
+        "observer": scene.observer,
+        "card": scene.card,
+        "room": scene.room,
+        "render": scene.render,
+    }.get(table)
     if table == "wall" and name in ("sigma_deg", "scale"):
         (train, _) = scene.wall.brdf.parts  # type: ignore[attr-defined]
         return math.degrees(train.sigma) if name == "sigma_deg" else train.scale
@@ -235,7 +281,9 @@ def scene_cases() -> Iterator[Case]:
                 scene = loaded(scene_text(t, n, v))  # refused, most of them
                 # What is accepted must stand there as Python reads it, and make films without NaN or a warning, or refuse to.
                 kept = kept_value(scene, t, n)
-                if kept is not None and (not isinstance(kept, (int, float)) or abs(kept - float(v)) > 1e-12 * abs(float(v))):
+                if kept is not None and (
+                    not isinstance(kept, (int, float)) or abs(kept - float(v)) > 1e-12 * abs(float(v))
+                ):
                     raise RuntimeError(f"became {kept}")
                 if not np.all(np.isfinite(scene.source)):
                     return math.nan, 0.0
@@ -275,7 +323,9 @@ def single_file_cases() -> Iterator[Case]:
 
         with folder() as at:
             pixels = np.full((1, 2), value, dtype=np.float16)
-            with OpenEXR.File({"type": OpenEXR.scanlineimage, "compression": OpenEXR.NO_COMPRESSION}, {"Y": pixels}) as file:
+            with OpenEXR.File(
+                {"type": OpenEXR.scanlineimage, "compression": OpenEXR.NO_COMPRESSION}, {"Y": pixels}
+            ) as file:
                 file.write(str(at / "a.exr"))
             found = read_exr(at / "a.exr")
         same = np.array_equal(found.channels["Y"].astype(np.float64), pixels.astype(np.float64), equal_nan=True)
@@ -288,7 +338,9 @@ def single_file_cases() -> Iterator[Case]:
         with folder() as at:
             scipy.io.savemat(at / "a.mat", {"g": values})
             found = read_matrices(at / "a.mat", ["g"])["g"]
-        return (0.0 if np.array_equal(found, np.atleast_2d(np.asarray(values)).astype(np.float64), equal_nan=True) else 1.0), 0.0
+        return (
+            0.0 if np.array_equal(found, np.atleast_2d(np.asarray(values)).astype(np.float64), equal_nan=True) else 1.0
+        ), 0.0
 
     for value in (0.0, 5e-324, 1e300, math.inf, math.nan):
         yield Case("read_matrices", "number", f"{value:g}", answered(lambda v=value: mat(np.full((2, 3), v))))
@@ -314,7 +366,9 @@ def single_file_cases() -> Iterator[Case]:
     for value in (0.0, 5e-324, 1e300, math.inf, math.nan):
         yield Case("read_table, .npy", "number", f"{value:g}", answered(lambda v=value: npy(np.full((2, 3), v))))
     for dtype in ("f2", "f4", ">f8", "i1", "u8"):
-        yield Case("read_table, .npy", "type", str(np.dtype(dtype)), answered(lambda d=dtype: npy(np.ones((2, 2), dtype=d))))
+        yield Case(
+            "read_table, .npy", "type", str(np.dtype(dtype)), answered(lambda d=dtype: npy(np.ones((2, 2), dtype=d)))
+        )
     for name, values in (
         ("complex", np.ones((2, 2), dtype=complex)),
         ("text", np.array(["a"])),
