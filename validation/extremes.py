@@ -16,15 +16,28 @@ from dataclasses import asdict
 from pathlib import Path
 
 from extreme_cases import (
+    alternating,
     blind,
     bounces,
+    bounds,
     brdfs,
+    calibrating,
+    capture_sets,
+    commands,
+    comparing,
     convolutions,
     deconvolution,
     geometry,
     invariances,
+    inverse,
     kernels,
+    lost_light,
+    moving_camera,
+    planning,
     rendering,
+    scene_files,
+    single_files,
+    solver_options,
     solving,
     tables,
     transport,
@@ -36,18 +49,10 @@ from wallmirror.files import write_atomically
 HERE = Path(__file__).parent
 #: The topics, in the order of the page.
 TOPICS = (
-    geometry,
-    brdfs,
-    tables,
-    transport,
-    kernels,
-    bounces,
-    convolutions,
-    deconvolution,
-    blind,
-    solving,
-    invariances,
-    rendering,
+    *(geometry, brdfs, tables, transport, kernels, bounces, convolutions, deconvolution, blind),
+    *(solving, inverse, lost_light, solver_options, moving_camera, calibrating, alternating, bounds, invariances),
+    *(rendering, comparing, planning),
+    *(capture_sets, scene_files, single_files, commands),
 )
 
 

@@ -78,8 +78,8 @@ def write_exr(
     Raises
     ------
     InputError
-        If shapes differ, a value is no real number or, though finite, beyond float32, or the file cannot be written; an earlier file of that
-        name is then untouched.
+        If shapes differ, a value is no real number or, though finite, beyond float32, or the file cannot be written; an
+        earlier file of that name is then untouched.
 
     Examples
     --------

@@ -20,8 +20,7 @@ from wallmirror.derendering.bounds import cramer_rao
 from wallmirror.derendering.likelihood import moments
 from wallmirror.derendering.poisson import poisson_bound
 
-from .harness import DIGITS, Case
-from .inverse import answered, refused
+from .harness import DIGITS, Case, must_answer, must_refuse
 from .scenes import card, lobes, observer
 
 Array = NDArray[np.float64]
@@ -159,7 +158,7 @@ def forecast_cases() -> Iterator[Case]:
             # Denormal numbers know themselves to 5e-324.
             return max(errors), 1e-9 + 1e-323 / min(v, n)
 
-        yield Case("foresee", "light, noise", f"{light:g}, {noise:g}", answered(scaled))
+        yield Case("foresee", "light, noise", f"{light:g}, {noise:g}", must_answer(scaled))
     for value in (0.0, -1.0, math.nan, math.inf):
 
         def one_entry(v: float = value) -> wm.Forecast:
@@ -174,7 +173,7 @@ def forecast_cases() -> Iterator[Case]:
                 weights="cosine",
             )  # type: ignore[arg-type]
 
-        yield Case("foresee", "noise of one pixel", f"{value:g}", refused(one_entry))
+        yield Case("foresee", "noise of one pixel", f"{value:g}", must_refuse(one_entry))
     for value in (1e-300, 1e300):
 
         def spotted(v: float = value) -> tuple[float, float]:
@@ -198,14 +197,14 @@ def forecast_cases() -> Iterator[Case]:
             "foresee",
             "pattern",
             f"{value:g}",
-            refused(lambda v=value: foreseen(changes={"source": np.full((3, 3), v)})),
+            must_refuse(lambda v=value: foreseen(changes={"source": np.full((3, 3), v)})),
         )
     for step in (0.0, -1.0, math.nan, math.inf):
 
         def stepped(v: float = step) -> wm.Forecast:
             return wm.foresee(observer(), card(), lobes(), np.eye(3), noise=1e-3, step_deg=v)
 
-        yield Case("foresee", "step_deg", f"{step:g}", refused(stepped))
+        yield Case("foresee", "step_deg", f"{step:g}", must_refuse(stepped))
     strips = {"element_width": 0.0, "element_height": 0.0}
     for quantity, value, changes in (
         ("elements M", "1", {"card": card(elements_x=(0.2,), **strips), "source": np.ones((1, 3))}),
@@ -230,7 +229,7 @@ def forecast_cases() -> Iterator[Case]:
     for metres in (1e-6, 1e-2, 1e2, 1e8):
         yield Case("foresee", "card's distance", f"{metres:g} m", lambda m=metres: (
             (math.nan if math.isnan(foreseen(changes={"card": card(y=-m, **strips)}).source_error) else 0.0), 1.0))  # fmt: skip
-        yield Case("foresee", "whole scene", f"x {metres:g}", answered(lambda m=metres: _rescaled(m)))
+        yield Case("foresee", "whole scene", f"x {metres:g}", must_answer(lambda m=metres: _rescaled(m)))
 
 
 def _rescaled(m: float) -> tuple[float, float]:

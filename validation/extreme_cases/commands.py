@@ -19,8 +19,8 @@ import numpy as np
 import wallmirror as wm
 from wallmirror.cli import main
 
-from .files import scene_text
 from .harness import Case
+from .scene_files import scene_text
 from .scenes import films
 
 

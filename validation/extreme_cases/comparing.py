@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 import wallmirror as wm
 from wallmirror.comparison import cross_weights, detectable_gain
 
-from .harness import DIGITS, EPS, Case
-from .inverse import answered, refused
+from .harness import DIGITS, EPS, Case, must_answer, must_refuse
 
 Array = NDArray[np.float64]
 
@@ -78,7 +77,7 @@ def scale_cases() -> Iterator[Case]:
                     raise RuntimeError(f"passed: {found.passed} at a gain error of {g:g}")
                 return gained(found, g)
 
-            yield Case("compare", f"radiance, gain error {gain:g}", f"1e{power:+d}", answered(scaled))
+            yield Case("compare", f"radiance, gain error {gain:g}", f"1e{power:+d}", must_answer(scaled))
     for power in (-1000, 900):
 
         def exact(p: int = power) -> tuple[float, float]:
@@ -87,7 +86,7 @@ def scale_cases() -> Iterator[Case]:
             same = numbers(plain) == numbers(found) and np.array_equal(plain.z, found.z, equal_nan=True)
             return 0.0 if same else 1.0, 0.0
 
-        yield Case("compare", f"radiance x 2^{power}", "exact", answered(exact))
+        yield Case("compare", f"radiance x 2^{power}", "exact", must_answer(exact))
     yield Case("compare", "radiance", "denormal (1e-310)", lambda: gained(wm.compare(*pictures(level=1e-310)), 0.0))
 
     def dark() -> tuple[float, float]:
@@ -111,7 +110,7 @@ def scale_cases() -> Iterator[Case]:
                 (seeds if w == "seeds" else reference)[..., 3] = v
                 return wm.compare(seeds, reference)
 
-            yield Case("compare", f"a pixel of the {which}", f"{value:g}", refused(spoilt))
+            yield Case("compare", f"a pixel of the {which}", f"{value:g}", must_refuse(spoilt))
     for value in (1e300, -1e300, 1e-300, 0.0):
 
         def outlier(v: float = value) -> tuple[float, float]:
@@ -132,7 +131,7 @@ def scatter_cases() -> Iterator[Case]:
                 raise RuntimeError("rejects the model that made the renders")
             return gained(found, 0.0)
 
-        yield Case("compare", "scatter over radiance", f"{noise:g}", answered(scattered))
+        yield Case("compare", "scatter over radiance", f"{noise:g}", must_answer(scattered))
 
         def biased(n: float = noise) -> tuple[float, float]:
             found = wm.compare(*pictures(noise=n, gain=0.5))
@@ -141,15 +140,15 @@ def scatter_cases() -> Iterator[Case]:
                 raise RuntimeError("passes a gain error of 0.5")
             return gained(found, 0.5)
 
-        yield Case("compare", "scatter over radiance, gain error 0.5", f"{noise:g}", answered(biased))
+        yield Case("compare", "scatter over radiance, gain error 0.5", f"{noise:g}", must_answer(biased))
     for count in (0, 1, 2, 7):
-        yield Case("compare", "seeds", str(count), refused(lambda c=count: wm.compare(*pictures(seeds=c))))
+        yield Case("compare", "seeds", str(count), must_refuse(lambda c=count: wm.compare(*pictures(seeds=c))))
     for count in (8, 5000):
         yield Case(
-            "compare", "seeds", str(count), answered(lambda c=count: gained(wm.compare(*pictures(seeds=c)), 0.0))
+            "compare", "seeds", str(count), must_answer(lambda c=count: gained(wm.compare(*pictures(seeds=c)), 0.0))
         )
     for views, pixels in ((1, 1), (1, 2), (1, 9), (1, 10), (1, 100_000), (200, 1)):
-        yield Case("compare", "views x pixels", f"{views} x {pixels}", answered(
+        yield Case("compare", "views x pixels", f"{views} x {pixels}", must_answer(
             lambda a=views, n=pixels: gained(wm.compare(*pictures(views=a, pixels=n, seeds=8)), 0.0)))  # fmt: skip
     for shape in ((0, 5), (3, 0)):
         yield Case("compare", "views x pixels", "{} x {}".format(*shape), lambda s=shape: (
@@ -161,14 +160,14 @@ def scatter_cases() -> Iterator[Case]:
         found = wm.compare(seeds, reference)
         return (0.0 if found.passed and found.z[0, 3] == 0 else 1.0), 0.5
 
-    yield Case("compare", "scatter of one pixel", "0", answered(quiet_pixel))
+    yield Case("compare", "scatter of one pixel", "0", must_answer(quiet_pixel))
 
     def one_scatters() -> tuple[float, float]:
         seeds, reference = pictures(noise=0.0)
         seeds[:, 0, 3] *= 1 + 1e-3 * np.random.default_rng(1).standard_normal(16)
         return gained(wm.compare(seeds, reference), 0.0)
 
-    yield Case("compare", "scatter of all but one pixel", "0", answered(one_scatters))
+    yield Case("compare", "scatter of all but one pixel", "0", must_answer(one_scatters))
     for off in (0.0, 1e-6, 1e-4, 0.1, 10.0):
 
         def one_pixel(d: float = off) -> tuple[float, float]:
@@ -191,7 +190,7 @@ def scatter_cases() -> Iterator[Case]:
             spread = float(np.std(ratios))
             return float(max(wrong)), 100 * EPS / spread * max(1.0, float(beyond / error))
 
-        yield Case("compare", "one pixel off by", f"{off:g}", answered(one_pixel))
+        yield Case("compare", "one pixel off by", f"{off:g}", must_answer(one_pixel))
 
 
 def option_cases() -> Iterator[Case]:
@@ -199,7 +198,9 @@ def option_cases() -> Iterator[Case]:
         def check() -> tuple[float, float]:
             return gained(wm.compare(*pictures(), **options), expected)
 
-        return Case("compare", quantity, value, check if good is None else answered(check) if good else refused(check))
+        return Case(
+            "compare", quantity, value, check if good is None else must_answer(check) if good else must_refuse(check)
+        )
 
     shape = (2, 40)
     for value in (0.0, 1e-300, 1e300, -1.0, math.nan, math.inf):
@@ -246,7 +247,7 @@ def weight_cases() -> Iterator[Case]:
                 # From 12 seeds and four neighbours a variance is known to a factor of two or so.
                 return (float(np.max(np.abs(np.log(got / ideal)))) if n else 0.0), math.log(4)
 
-            yield Case("cross_weights", f"radiance, scatter {noise:g}", f"1e{power:+d}", answered(weighed))
+            yield Case("cross_weights", f"radiance, scatter {noise:g}", f"1e{power:+d}", must_answer(weighed))
 
             def foretold(p: int = power, n: float = noise) -> tuple[float, float]:
                 seeds, reference = pictures(level=10.0**p, noise=n, seeds=8, draw=1)
@@ -255,7 +256,7 @@ def weight_cases() -> Iterator[Case]:
                 # Both are known to 1 / sqrt(2 S - 2), here 13 % of one and less of the other, so that five of that decide.
                 return abs(math.log(told / later)), 5 * 0.13
 
-            yield Case("detectable_gain", f"radiance, scatter {noise:g}", f"1e{power:+d}", answered(foretold))
+            yield Case("detectable_gain", f"radiance, scatter {noise:g}", f"1e{power:+d}", must_answer(foretold))
 
 
 def cases() -> Iterator[Case]:
@@ -288,4 +289,6 @@ def cases() -> Iterator[Case]:
         ("truth NaN", one, math.nan * one),
         ("shapes differ", one, np.ones(4)),
     ):
-        yield Case("scale_free_error", "arrays", name, refused(lambda e=estimate, t=truth: wm.scale_free_error(e, t)))
+        yield Case(
+            "scale_free_error", "arrays", name, must_refuse(lambda e=estimate, t=truth: wm.scale_free_error(e, t))
+        )

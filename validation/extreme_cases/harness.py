@@ -7,6 +7,8 @@ or a fault: a wrong number, a NaN, a warning of NumPy's, or any other exception.
 from __future__ import annotations
 
 import math
+import re
+import tempfile
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -20,6 +22,8 @@ import wallmirror as wm
 DIGITS = 50  # of the references that mpmath computes
 EPS = float(np.finfo(np.float64).eps)
 REFUSALS = (wm.InputError, wm.UndeterminedError)
+# The folder of a temporary file, whose name differs from run to run.
+_SCRATCH = re.compile(re.escape(tempfile.gettempdir()) + r"/tmp\w+/")
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ def run(case: Case) -> Cell:
             warnings.simplefilter("error")
             error, tolerance = case.check()
     except REFUSALS as refusal:
-        return Cell(*name, "refused", None, None, str(refusal))
+        return Cell(*name, "refused", None, None, _SCRATCH.sub("", str(refusal)))
     except Exception as failure:  # noqa: BLE001 - that is what the table is about
         return Cell(*name, "fault", None, None, f"{type(failure).__name__}: {failure}")
     if not math.isfinite(error):
@@ -98,3 +102,15 @@ def must_refuse(call: Callable[[], object]) -> Callable[[], tuple[float, float]]
         raise RuntimeError(f"accepted, with the result {str(call())[:60]}")
 
     return check
+
+
+def must_answer(check: Callable[[], tuple[float, float]]) -> Callable[[], tuple[float, float]]:
+    """The check of an input whose right answer is within reach: a refusal is a fault."""
+
+    def strict() -> tuple[float, float]:
+        try:
+            return check()
+        except REFUSALS as refusal:
+            raise RuntimeError(f"refused what it can answer: {refusal}") from None
+
+    return strict

@@ -23,9 +23,8 @@ from wallmirror.planning.sampling import LEAST_SEEDS, NoiseLevel, cheapest_sampl
 from wallmirror.tradeoff.budget import PASS, Costs, affordable
 from wallmirror.tradeoff.pareto import fit_line, short_seconds
 
-from .files import scene_text
-from .harness import DIGITS, EPS, Case
-from .inverse import answered, refused
+from .harness import DIGITS, EPS, Case, must_answer, must_refuse
+from .scene_files import scene_text
 
 
 def in_the_open(level: str = "1.0") -> wm.Scene:
@@ -64,12 +63,12 @@ def advised(tolerance: float, level: str = "1.0") -> tuple[float, float]:
 
 def advice_cases() -> Iterator[Case]:
     for value in (0.0, -1.0, 1e-16, 9e-6, 0.51, 1e3, math.inf, math.nan):
-        yield Case("advise", "tolerance", f"{value:g}", refused(lambda t=value: advise(in_the_open(), t)))
+        yield Case("advise", "tolerance", f"{value:g}", must_refuse(lambda t=value: advise(in_the_open(), t)))
     for value in (1e-5, 1e-2, 0.5):
-        yield Case("advise", "tolerance", f"{value:g}", answered(lambda t=value: advised(t)))
+        yield Case("advise", "tolerance", f"{value:g}", must_answer(lambda t=value: advised(t)))
     for level in ("1e-300", "1e-30", "1e30", "1e300"):
         yield Case("advise", "radiance", level, lambda v=level: advised(1e-2, v))
-    yield Case("advise", "radiance", "0", refused(lambda: advise(in_the_open("0.0"), 1e-2)))
+    yield Case("advise", "radiance", "0", must_refuse(lambda: advise(in_the_open("0.0"), 1e-2)))
 
 
 def sampling_cases() -> Iterator[Case]:
@@ -87,12 +86,12 @@ def sampling_cases() -> Iterator[Case]:
     for noise in (1e-300, 1e-12, 1e-2, 1.0, 1e300):
         yield Case("cheapest_sampling", "noise wanted", f"{noise:g}", lambda n=noise: sampled(n))
     for noise in (0.0, -1.0, math.nan, math.inf):
-        yield Case("cheapest_sampling", "noise wanted", f"{noise:g}", refused(lambda n=noise: sampled(n)))
+        yield Case("cheapest_sampling", "noise wanted", f"{noise:g}", must_refuse(lambda n=noise: sampled(n)))
     for level in (0.0, 1e-300, 1e300):
         yield Case("cheapest_sampling", "noise of the pilot", f"{level:g}", lambda v=level: sampled(1e-2, level=v))
     for level in (-1.0, math.nan, math.inf):
         yield Case(
-            "cheapest_sampling", "noise of the pilot", f"{level:g}", refused(lambda v=level: sampled(1e-2, level=v))
+            "cheapest_sampling", "noise of the pilot", f"{level:g}", must_refuse(lambda v=level: sampled(1e-2, level=v))
         )
     for seconds in (0.0, 1e-300, 1e300):
         yield Case(
@@ -106,7 +105,9 @@ def sampling_cases() -> Iterator[Case]:
             return float(abs(mpmath.mpf(found) / exact - 1)) if exact else found, 4 * EPS
 
     for bias, noise in ((0.0, 0.0), (1e-300, 1e-300), (1e300, 1e300), (1e-300, 1e300), (0.3, 0.4)):
-        yield Case("total_error", "bias, noise", f"{bias:g}, {noise:g}", answered(lambda b=bias, n=noise: summed(b, n)))
+        yield Case(
+            "total_error", "bias, noise", f"{bias:g}, {noise:g}", must_answer(lambda b=bias, n=noise: summed(b, n))
+        )
 
 
 def afforded(seconds: float, start: float, sample: float) -> tuple[float, float]:
@@ -128,7 +129,7 @@ def law_cases() -> Iterator[Case]:
     for seconds in (0.0, 1e-300, 1e-6, 1e-3, 1.0, 1e6, 1e15, 1e300):
         yield Case("affordable", "seconds", f"{seconds:g}", lambda s=seconds: afforded(s, 1e-3, 1e-6))
     for seconds in (-1.0, math.nan, math.inf):
-        yield Case("affordable", "seconds", f"{seconds:g}", refused(lambda s=seconds: afforded(s, 1e-3, 1e-6)))
+        yield Case("affordable", "seconds", f"{seconds:g}", must_refuse(lambda s=seconds: afforded(s, 1e-3, 1e-6)))
     for start, sample in ((0.0, 1e-6), (1e-3, 1e-12), (1e3, 1e-6), (0.0, 1e-300), (1e300, 1e-6)):
         yield Case(
             "affordable", "start, sample", f"{start:g}, {sample:g} s", lambda a=start, b=sample: afforded(1.0, a, b)
@@ -138,7 +139,7 @@ def law_cases() -> Iterator[Case]:
             "affordable",
             "start, sample",
             f"{start:g}, {sample:g} s",
-            refused(lambda a=start, b=sample: afforded(1.0, a, b)),
+            must_refuse(lambda a=start, b=sample: afforded(1.0, a, b)),
         )
 
     def line(factor: float, slope: float, x: Any) -> tuple[float, float]:
@@ -153,12 +154,15 @@ def law_cases() -> Iterator[Case]:
         return max(abs(found.slope - slope), within / size), allowed
 
     for factor in (1e-300, 1.0, 1e300):
-        yield Case("fit_line", "factor", f"{factor:g}", answered(lambda f=factor: line(f, -0.5, [1.0, 10.0, 100.0])))
+        yield Case("fit_line", "factor", f"{factor:g}", must_answer(lambda f=factor: line(f, -0.5, [1.0, 10.0, 100.0])))
     for slope in (-300.0, 0.0, 1e-12, 2.0, 290.0):
-        yield Case("fit_line", "slope", f"{slope:g}", answered(lambda s=slope: line(1.0, s, [1.0, 3.0, 10.0])))
+        yield Case("fit_line", "slope", f"{slope:g}", must_answer(lambda s=slope: line(1.0, s, [1.0, 3.0, 10.0])))
     for x in ([1e-300, 1.0, 1e300], [1.0, 1 + 1e-9, 1 + 2e-9], [1.0, 2.0]):
         yield Case(
-            "fit_line", "sizes", str(x), answered(lambda v=x: line(3.0, 1.0, v) if v[-1] < 1e299 else line(1.0, 1.0, v))
+            "fit_line",
+            "sizes",
+            str(x),
+            must_answer(lambda v=x: line(3.0, 1.0, v) if v[-1] < 1e299 else line(1.0, 1.0, v)),
         )
     for name, x, y in (
         ("one size", [1.0], [1.0]),
@@ -171,7 +175,7 @@ def law_cases() -> Iterator[Case]:
         ("error inf", [1.0, 2.0], [math.inf, 1.0]),
         ("unequal numbers", [1.0, 2.0], [1.0]),
     ):
-        yield Case("fit_line", "points", name, refused(lambda a=x, b=y: fit_line(a, b)))
+        yield Case("fit_line", "points", name, must_refuse(lambda a=x, b=y: fit_line(a, b)))
 
     def crossing(slope: float, level: float) -> tuple[float, float]:
         x = fit_line([1.0, 10.0], [1.0, 10.0**slope]).where(level)
@@ -183,11 +187,11 @@ def law_cases() -> Iterator[Case]:
 
     for slope, level in ((-0.5, 1e-300), (1.0, 1e300), (1e-3, 2.0), (-1e-3, 1e-3), (2.0, 1.0)):
         yield Case(
-            "Line.where", "slope, value", f"{slope:g}, {level:g}", answered(lambda s=slope, v=level: crossing(s, v))
+            "Line.where", "slope, value", f"{slope:g}, {level:g}", must_answer(lambda s=slope, v=level: crossing(s, v))
         )
     for slope, level in ((0.0, 2.0), (1.0, 0.0), (1.0, -1.0), (1.0, math.nan)):
         yield Case(
-            "Line.where", "slope, value", f"{slope:g}, {level:g}", refused(lambda s=slope, v=level: crossing(s, v))
+            "Line.where", "slope, value", f"{slope:g}, {level:g}", must_refuse(lambda s=slope, v=level: crossing(s, v))
         )
     for seconds, words in (
         (0.0, "0 µs"),
@@ -199,7 +203,7 @@ def law_cases() -> Iterator[Case]:
         (3600.0, "1 h"),
         (1e300, "2.78e+296 h"),
     ):
-        yield Case("short_seconds", "seconds", f"{seconds:g}", answered(
+        yield Case("short_seconds", "seconds", f"{seconds:g}", must_answer(
             lambda s=seconds, w=words: (0.0 if short_seconds(s) == w else 1.0, 0.5)))  # fmt: skip
 
 

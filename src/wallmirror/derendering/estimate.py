@@ -107,8 +107,8 @@ def scale_free_error(estimate: Array, truth: Array, groups: tuple[tuple[int, ...
     if not np.any(arrays["truth"]):
         return math.inf
     # In units of the largest entry each, so that squares neither overflow nor vanish.
-    found, sought = (values / (float(np.max(np.abs(values))) or 1.0) for values in arrays.values())
-    parts = [list(group) for group in groups] or [slice(None)]
+    found, sought = (np.atleast_1d(values) / (float(np.max(np.abs(values))) or 1.0) for values in arrays.values())
+    parts = [list(group) for group in groups] or [list(range(len(sought)))]
     missed = [_missed(found[part], sought[part]) for part in parts]
     return float(np.linalg.norm(missed) / np.linalg.norm(sought))
 
