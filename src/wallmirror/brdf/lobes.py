@@ -323,8 +323,8 @@ def _require_parts(parts: tuple[BRDF, ...]) -> None:
 
 
 def _power_of_cosine(angle: Array, exponent: float) -> Array:
-    """cos(angle)^n for angles from 0 to pi/2, to eps of the peak: a rounded cosine near 1 would be off by n eps."""
-    if exponent < 8:
+    """cos(angle)^n for angles from 0 to pi/2, to some ten eps of the peak: a rounded cosine near 1 is off by n / 2 eps."""
+    if exponent <= 64:
         return np.asarray(np.cos(angle) ** exponent, dtype=np.float64)
     fall = np.minimum(2 * np.sin(0.5 * angle) ** 2, 1 - _LEAST_COSINE)  # 1 - cos
     return np.asarray(np.exp(exponent * np.log1p(-fall)), dtype=np.float64)
