@@ -108,8 +108,8 @@ def _phong_illumination(n: float) -> tuple[float, float]:
             front = abs(s + o) < math.pi / 2
             exact.append(mpmath.cos(u) ** n / mpmath.cos(mpmath.mpf(s)) if front else mpmath.mpf(0))
         found = [float(brdf(s, o)) for s, o in PAIRS]
-        # Of each value itself, as it grows without bound; where a lobe has fallen to 1e-290 its exponent is 700.
-        return off_relative(found, exact), 16 * EPS * (1 + min(n, 700.0))
+        # Of each value itself, as it grows without bound; down to 1e-100, where a lobe's exponent has grown to 230.
+        return off_relative(found, exact, floor=1e-100), 16 * EPS * (1 + min(n, 230.0))
 
 
 def fresnel_cases() -> Iterator[Case]:

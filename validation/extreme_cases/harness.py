@@ -82,14 +82,14 @@ def off(found: ArrayLike, exact: ArrayLike) -> float:
     return float(np.max(np.abs(np.ldexp(one, -exponent) - np.ldexp(two, -exponent)))) / math.ldexp(largest, -exponent)
 
 
-def off_relative(found: ArrayLike, exact: Iterable[mpmath.mpf]) -> float:
-    """Largest relative difference of single values, at the precision that mpmath has; below 1e-290 they may be 0."""
+def off_relative(found: ArrayLike, exact: Iterable[mpmath.mpf], *, floor: float = 1e-290) -> float:
+    """Largest relative difference of single values, at the precision that mpmath has; what is below the floor may be 0."""
 
     def ratio(value: float, true: mpmath.mpf) -> float:
         if not math.isfinite(value):
             return math.nan
-        if abs(true) < mpmath.mpf("1e-290"):
-            return 0.0 if abs(value) < 1e-289 else math.inf
+        if abs(true) < floor:
+            return 0.0 if abs(value) < 10 * floor else math.inf
         return float(abs(mpmath.mpf(value) / true - 1))
 
     return float(np.max([ratio(float(f), e) for f, e in zip(np.ravel(found), exact, strict=True)]))
