@@ -36,8 +36,9 @@ def _topics(*names: str) -> tuple[ModuleType, ...]:
 harness, scenes, geometry, brdfs, tables, transport = _topics(
     "harness", "scenes", "geometry", "brdfs", "tables", "transport"
 )
-kernels, bounces, convolutions = _topics("kernels", "bounces", "convolutions")
-deconvolution, blind, solving, invariances = _topics("deconvolution", "blind", "solving", "invariances")
+kernels, bounces, convolutions, half_circle = _topics("kernels", "bounces", "convolutions", "half_circle")
+operators, regularising, richardson_lucy = _topics("operators", "regularising", "richardson_lucy")
+channels, blind, solving, invariances = _topics("channels", "blind", "solving", "invariances")
 
 #: The groups of cells that take at most a second or two.
 QUICK = (
@@ -53,7 +54,11 @@ QUICK = (
     bounces.series_cases,
     bounces.card_cases,
     convolutions.cases,
-    deconvolution.cases,
+    half_circle.cases,
+    operators.cases,
+    regularising.cases,
+    richardson_lucy.cases,
+    channels.cases,
     blind.cases,
     invariances.cases,
 )
@@ -114,22 +119,22 @@ PLANTED = {
         convolutions.scaling_cases, "wall_convolution", "V, rho"),
     "squares of a render": (
         "convolution.hypotheses.power_of_two", _no_unit,
-        convolutions.hypothesis_cases, "relative_error", "both", "k = -900"),
+        half_circle.hypothesis_cases, "relative_error", "both", "k = -900"),
     "squares of the data": (
         "deconvolution.checking.power_of_two", _no_unit,
-        deconvolution.richardson_lucy_cases, "richardson_lucy", "one", "1e+300"),
+        richardson_lucy.richardson_lucy_cases, "richardson_lucy", "one", "1e+300"),
     "squares of the truth": (
         "deconvolution.checking.power_of_two", _no_unit,
-        deconvolution.align_cases, "align", "estimate x", "-900, 0"),
+        richardson_lucy.align_cases, "align", "estimate x", "-900, 0"),
     "norms that underflow": (
         "deconvolution.checking.power_of_two", _no_unit,
-        deconvolution.choice_cases, "Spectrum norms", "alpha", "1, 1e-300"),
+        regularising.choice_cases, "Spectrum norms", "alpha", "1, 1e-300"),
     "sources in a unit of their own": (
         "deconvolution.cross_relation.rescaled", _unchanged,
-        blind.multichannel_cases, "identify_channels", "g x", "k = 900"),
+        channels.multichannel_cases, "identify_channels", "g x", "k = 900"),
     "a source in a unit of its own": (
         "deconvolution.least_squares_blind.rescaled", _unchanged,
-        blind.multichannel_cases, "least_squares_blind", "g x", "k = 900"),
+        channels.multichannel_cases, "least_squares_blind", "g x", "k = 900"),
 }  # fmt: skip
 
 
@@ -147,8 +152,8 @@ def test_the_table_shows_an_adjoint_that_convolves(monkeypatch):
         return np.resize(self._forward(data[: self._taken_shape[0]]), self._taken_shape)
 
     monkeypatch.setattr(Convolution, "_backward", forward_again)
-    assert _faults(deconvolution.operator_cases(), "toeplitz_matrix, Convolution.adjoint", "same")
-    assert _faults(deconvolution.operator_cases(), "adjoint_mismatch", "same", "(1000,)")
+    assert _faults(operators.operator_cases(), "toeplitz_matrix, Convolution.adjoint", "same")
+    assert _faults(operators.operator_cases(), "adjoint_mismatch", "same", "(1000,)")
 
 
 @pytest.mark.parametrize("intensity", ["1e-300", "1e+300", "denormal (1e-310)"])
