@@ -68,13 +68,14 @@ def discrepancy_alpha(
     """
     target = positive(factor, "factor") * positive(noise_norm, "noise_norm")
     residual: Callable[[float], float]
+    unit = 1.0
     if isinstance(residual_norm, Spectrum):
         lowest, highest = _range(residual_norm)
         low = lowest * _ROUNDING**2 if low is None else low
         high = highest if high is None else high
         # In the spectrum's own unit, where the residual at the lowest alpha is no zero.
-        residual = replace(residual_norm, unit=1.0).residual_norm
-        target /= residual_norm.unit
+        residual, unit = replace(residual_norm, unit=1.0).residual_norm, residual_norm.unit
+        target /= unit
     elif low is None or high is None:
         raise InputError("a function of alpha needs `low` and `high`", field="residual_norm")
     else:
@@ -82,8 +83,8 @@ def discrepancy_alpha(
     at_low, at_high = residual(positive(low, "low")), residual(positive(high, "high"))
     if not at_low < target < at_high:
         raise UndeterminedError(
-            f"no alpha from {low:.2g} to {high:.2g} leaves a residual of {target:.4g}: it runs from {at_low:.4g} to "
-            f"{at_high:.4g}; check the noise's size"
+            f"no alpha from {low:.2g} to {high:.2g} leaves a residual of {target * unit:.4g}: it runs from "
+            f"{at_low * unit:.4g} to {at_high * unit:.4g}; check the noise's size"
         )
     root = brentq(lambda t: math.log(residual(math.exp(t)) / target), math.log(low), math.log(high), xtol=1e-12)
     return math.exp(root)
