@@ -170,8 +170,9 @@ def test_extreme_intensities_are_solved(intensity):
         lambda: (float(np.float64(1e300) * np.float64(1e300)), 1.0),
         lambda: (float(np.linalg.inv(np.zeros((2, 2)))[0, 0]), 1.0),
         lambda: (0.0, math.nan),
+        lambda: (0.0, math.inf),
     ],
-    ids=["wrong", "NaN", "overflow warned of", "another exception", "no tolerance"],
+    ids=["wrong", "NaN", "overflow warned of", "another exception", "no tolerance", "any tolerance"],
 )
 def test_the_table_catches(check):
     assert harness.run(harness.Case("f", "x", "1", check)).outcome == "fault"

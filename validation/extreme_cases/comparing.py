@@ -64,6 +64,8 @@ def gained(found: wm.Comparison, gain: float) -> tuple[float, float]:
     """The gain within five of its standard errors and what float32 may do, if nothing is NaN."""
     if not np.all(np.isfinite(numbers(found))) or np.any(np.isinf(found.z)):
         return math.nan, 0.0
+    if math.isinf(found.gain.standard_error):  # nothing has a weight: what it says it would see is nothing
+        return (0.0 if math.isinf(found.gain.detectable) else 1.0), 0.5
     return abs(found.gain.estimate - gain), 5 * found.gain.standard_error + 2e-7
 
 

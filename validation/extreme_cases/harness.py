@@ -62,7 +62,7 @@ def run(case: Case) -> Cell:
         return Cell(*name, "fault", None, None, f"{type(failure).__name__}: {failure}")
     if not math.isfinite(error):
         return Cell(*name, "fault", None, tolerance, "the result is not a number")
-    if not error <= tolerance:
+    if not (error <= tolerance and math.isfinite(tolerance)):
         return Cell(*name, "fault", error, tolerance, f"off by {error:.1e}, allowed {tolerance:.1e}")
     return Cell(*name, "right", error, tolerance, "")
 
