@@ -27,9 +27,9 @@ from wallmirror.jobs.solving import judge
 from wallmirror.planning.plan import Term, total_error
 from wallmirror.planning.sampling import NoiseLevel, cheapest_sampling
 from wallmirror.table_files import read_table
-from wallmirror.tradeoff.budget import Costs, affordable
 from wallmirror.tradeoff.pareto import fit_line, reach_along_line
 from wallmirror.tradeoff.runs import Run
+from wallmirror.tradeoff.splits import Costs, affordable
 
 from .helpers import assert_undetermined, refused
 

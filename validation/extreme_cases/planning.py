@@ -20,8 +20,8 @@ import wallmirror as wm
 from wallmirror.jobs.advising import advise
 from wallmirror.planning.plan import Term, total_error
 from wallmirror.planning.sampling import LEAST_SEEDS, NoiseLevel, cheapest_sampling
-from wallmirror.tradeoff.budget import PASS, Costs, affordable
 from wallmirror.tradeoff.pareto import fit_line, short_seconds
+from wallmirror.tradeoff.splits import PASS, Costs, affordable
 
 from .harness import DIGITS, EPS, Case, must_answer, must_refuse
 from .scene_files import scene_text
