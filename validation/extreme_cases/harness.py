@@ -60,9 +60,9 @@ def run(case: Case) -> Cell:
         return Cell(*name, "refused", None, None, _SCRATCH.sub("", str(refusal)))
     except Exception as failure:  # noqa: BLE001 - that is what the table is about
         return Cell(*name, "fault", None, None, f"{type(failure).__name__}: {failure}")
-    if not math.isfinite(error):
-        return Cell(*name, "fault", None, tolerance, "the result is not a number")
-    if not (error <= tolerance and math.isfinite(tolerance)):
+    if not (math.isfinite(error) and math.isfinite(tolerance)):
+        return Cell(*name, "fault", None, None, "the result or what it may be off by is not a number")
+    if not error <= tolerance:
         return Cell(*name, "fault", error, tolerance, f"off by {error:.1e}, allowed {tolerance:.1e}")
     return Cell(*name, "right", error, tolerance, "")
 
