@@ -180,6 +180,11 @@ def test_few_pixels_that_any_knots_fit_widen_the_error():
     assert off > 5 * math.sqrt(found.mismatch) / found.gap
 
 
+def test_a_recovered_table_is_nan_of_nan_alone():
+    cells = [harness.run(case) for case in moving_camera.table_cases()]
+    assert [c.outcome for c in cells] == ["right"] * len(cells)
+
+
 def test_a_fit_that_misses_the_stated_noise_is_doubted():
     sets, source = moving_camera.positions(4, noise=1e-3)
     stated = [replace(c, variance=np.full(c.radiance.shape, (1e-3 * float(c.radiance.max())) ** 2)) for c in sets]

@@ -50,7 +50,28 @@ def positions(
     return sets, source
 
 
+def table_cases() -> Iterator[Case]:
+    """A recovered table where it was not asked for: at its knots' ends beyond them, and NaN only of NaN."""
+
+    def called(angle: float) -> tuple[float, float]:
+        sets, _ = positions(noise=NOISE)
+        table = solve_general(sets).brdf
+        ends = table.grid.theta_s
+        inside = min(max(angle, ends.start), ends.stop)
+        if table.seen(angle, 0.1) != (inside == angle and bool(table.seen(inside, 0.1))):
+            raise RuntimeError(f"says that it saw {angle:g}")
+        found = float(table(angle, 0.1))
+        if math.isnan(angle):
+            return (0.0 if math.isnan(found) else 1.0), 0.5
+        return abs(found - float(table(inside, 0.1))), 0.0
+
+    for angle in (0.0, 1e-320, math.pi / 2, 1e300, -1e300, math.inf, math.nan):
+        yield Case("SplineTable", "angle", f"{angle:g} rad", must_answer(lambda a=angle: called(a)))
+
+
 def cases() -> Iterator[Case]:
+    yield from table_cases()
+
     def each(quantity: str, value: str, good: bool | None, **changes: Any) -> Case:
         options = {name: changes.pop(name) for name in ("step_deg", "reciprocal") if name in changes}
         spoil = changes.pop("spoil", None)
