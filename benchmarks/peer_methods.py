@@ -166,7 +166,6 @@ class Bilinear:
     designs: list[sp.csr_array]
     preparation: float
     scale: Array  # of r, so that all its entries are seen alike
-    stacked: sp.csr_array  # N_ij for all i, j on top of each other, (M M K, K)
     data: Array  # D / its largest entry, (P, B)
     tall: sp.csr_array  # T_1 .. T_M on top of each other, (M P, K)
 
@@ -182,11 +181,10 @@ class Bilinear:
     def over(cls, data: Array, designs: list[sp.csr_array], started: float) -> Bilinear:
         """Sum data (P, B) up over design matrices."""
         summed = moments(data, designs)
-        stacked = summed.pairs[0].stacked
         # Unseen coefficients change nothing, whatever their scale.
         scale = 1 / np.sqrt(np.maximum(summed.exposure, 1e-6))
         tall = sp.csr_array(sp.vstack(designs, format="csr"))
-        return cls(summed, designs, time.perf_counter() - started, scale, stacked, data, tall)
+        return cls(summed, designs, time.perf_counter() - started, scale, data, tall)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -199,8 +197,7 @@ class Bilinear:
 
     def objective(self, coefficients: Array, source: Array) -> tuple[float, Array, Array]:
         """f, its gradient in r (K,) and its gradient in V (M, B)."""
-        size, elements, _ = self.shape
-        pair = (self.stacked @ coefficients).reshape(elements, elements, size)
+        pair = self.summed.pairs[0].times(coefficients)
         normal, moment = pair @ coefficients, (self.summed.cross @ coefficients).T
         pull = normal @ source
         value = float(np.sum(self.summed.energy)) + float(np.sum(source * (pull - 2 * moment)))
@@ -226,8 +223,8 @@ class Bilinear:
 
     def best_source(self, coefficients: Array, *, nonnegative: bool) -> Array:
         """The V that minimises f for a given r, shape (M, B): small least squares problems with one matrix."""
-        size, elements, realisations = self.shape
-        normal = (self.stacked @ coefficients).reshape(elements, elements, size) @ coefficients
+        _, elements, realisations = self.shape
+        normal = self.summed.pairs[0].times(coefficients) @ coefficients
         moment = self.summed.cross @ coefficients
         if nonnegative:
             upper = np.full((realisations, elements), _NO_BOUND)

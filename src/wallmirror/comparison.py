@@ -36,6 +36,8 @@ _TILE = 10
 # Relative error that a renderer in float32 has in every sample alike, so that no number of samples averages it away.
 _FLOAT32 = float(np.finfo(np.float32).eps)
 _FOLDS = 4
+# What renders and templates may hold over the largest value of the reference, so that no sum of squares overflows.
+_LARGEST = 1e100
 # Neighbours whose scatter steadies that of a pixel, and how many seeds their mean is worth.
 _NEIGHBOURS = 5
 _PRIOR_SEEDS = 10
@@ -166,18 +168,19 @@ def compare(
     Raises
     ------
     InputError
-        For fewer than eight seeds or shapes that do not match.
+        For fewer than eight seeds, shapes that do not match, and values that are not finite, or so large beside the
+        reference that squares leave the range of float64.
     """
     if seeds.ndim != 3 or seeds.shape[1:] != reference.shape:
         raise InputError(f"renders of shape {seeds.shape} do not match a reference of shape {reference.shape}")
     if seeds.shape[0] < 8:
         raise InputError(f"{seeds.shape[0]} seeds are too few to know their scatter; render at least 8", field="seeds")
-    if not (np.all(np.isfinite(seeds)) and np.all(np.isfinite(reference))):
-        raise InputError("holds a value that is not finite", field="seeds")
+    _require_comparable(seeds, reference, templates or {}, edges, weights)
     seeds, reference, *others = in_its_unit(reference, seeds, reference, *(templates or {}).values())
+    for name, values in zip(("seeds", *(f"templates {name}" for name, _ in templates or {})), (seeds, *others)):
+        if not np.all(np.abs(values) <= _LARGEST):
+            raise InputError(f"holds more than {_LARGEST:g} times what the reference does", field=name)
     templates = dict(zip(templates or {}, others, strict=True))
-    if not np.all(np.isfinite(seeds)):
-        raise InputError("holds a value that no float64 can hold beside the reference", field="seeds")
     brightest = float(reference.max(initial=0.0))
     no_edges = np.ones(reference.shape, dtype=bool) if edges is None else ~edges
     bright = reference > _STARVED * brightest
@@ -188,8 +191,6 @@ def compare(
     lit = keep & (brightest > 0)
     if weights is None:
         weights = np.divide(1.0, (reference + 1e-2 * brightest) ** 2, out=np.zeros(reference.shape), where=lit)
-    elif weights.shape not in (reference.shape, seeds.shape):
-        raise InputError(f"has shape {weights.shape}; give {reference.shape} or {seeds.shape}", field="weights")
     weights = np.broadcast_to(np.where(lit, weights, 0.0), seeds.shape)
     shapes = {("gain", "of 1"): reference, **templates}
     # One level for all tests of this comparison: the biases, the largest score and the tiles.
@@ -227,6 +228,29 @@ def compare(
         edges=int((~no_edges).sum()),
         exact=exact,
     )
+
+
+def _require_comparable(
+    seeds: Array,
+    reference: Array,
+    templates: dict[tuple[str, str], Array],
+    edges: NDArray[np.bool_] | None,
+    weights: Array | None,
+) -> None:
+    """Refuse shapes that do not match and values that are not finite, by the name of what holds them."""
+    for (name, _), template in templates.items():
+        if template.shape != reference.shape:
+            raise InputError(f"has shape {template.shape}; give {reference.shape}", field=f"templates {name}")
+    if edges is not None and (edges.shape != reference.shape or edges.dtype != np.bool_):
+        raise InputError(f"holds {edges.dtype} of shape {edges.shape}; give bool of {reference.shape}", field="edges")
+    if weights is not None and weights.shape not in (reference.shape, seeds.shape):
+        raise InputError(f"has shape {weights.shape}; give {reference.shape} or {seeds.shape}", field="weights")
+    given = {"seeds": seeds, "reference": reference, **{f"templates {name}": t for (name, _), t in templates.items()}}
+    for name, values in given.items():
+        if not np.all(np.isfinite(values)):
+            raise InputError("holds a value that is not finite", field=name)
+    if weights is not None and not (np.all(np.isfinite(weights)) and np.all(weights >= 0)):
+        raise InputError("holds a weight that is negative or not finite", field="weights")
 
 
 def in_its_unit(reference: Array, *arrays: Array) -> list[Array]:

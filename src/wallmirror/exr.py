@@ -78,8 +78,8 @@ def write_exr(
     Raises
     ------
     InputError
-        If shapes differ, a finite value is beyond float32, or the file cannot be written; an earlier file of that
-        name is then untouched.
+        If shapes differ, a value is no real number or, though finite, beyond float32, or the file cannot be written; an
+        earlier file of that name is then untouched.
 
     Examples
     --------
@@ -143,6 +143,8 @@ def read_exr(path: str | Path, *, max_pixels: int = MAX_PIXELS) -> ExrImage:
 
 def _float32(values: ArrayLike, name: str, path: Path) -> Pixels:
     exact = np.asarray(values)
+    if exact.dtype.kind not in "fiub":
+        raise InputError(f"holds {exact.dtype}; give real numbers", file=path, field=name)
     with np.errstate(over="ignore"):
         # OpenEXR writes Fortran-ordered and strided arrays wrongly without a word.
         rounded = np.ascontiguousarray(exact, dtype=np.float32)

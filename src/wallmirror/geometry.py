@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 # Lengths in metres beyond which squares and cubes of them would leave the range of float64.
 _SHORTEST, _LONGEST = 1e-100, 1e100
+_NARROWEST = 1e-100  # field of view in radians
+_MOST_VIEWS = 10**6
 
 #: Where the samples of a view lie: the centres of finite pixels, or points from edge to edge of the field.
 PixelPlacement = Literal["centres", "edges"]
@@ -63,13 +65,12 @@ class Observer:
                 field="observer.position",
             )
         _require_lengths("observer.position", self.position[:1], distance=self.distance)
-        if not 0 < self.fov < math.pi:
+        if not _NARROWEST <= self.fov < math.pi:
             raise InputError(
                 f"a field of view of {math.degrees(self.fov):g} deg is not between 0 and 180",
                 field="observer.fov_deg",
             )
-        if self.pixels < 1:
-            raise InputError(f"needs at least one pixel, not {self.pixels}", field="observer.pixels")
+        require_count("observer.pixels", self.pixels, "pixel")
         if self.pixels_at == "edges" and self.pixels < 2:
             raise InputError('pixels_at = "edges" needs at least two pixels', field="observer.pixels")
         if self.pixels_at not in ("centres", "edges"):
@@ -178,15 +179,27 @@ def scan_angles(views: int, *, scan: float, fov: float) -> tuple[float, ...]:
     views:
         A >= 1. A single view looks straight at the wall.
     scan, fov:
-        Full width of the scan and of one field in radians; scan >= fov.
+        Full width of the scan and of one field in radians; pi >= scan >= fov > 0.
+
+    Raises
+    ------
+    InputError
+        For fewer than one or more than a million views, or widths out of range.
 
     Examples
     --------
     >>> [round(math.degrees(a), 1) for a in scan_angles(3, scan=math.radians(90), fov=math.radians(60))]
     [15.0, 0.0, -15.0]
     """
-    if views < 1:
-        raise InputError(f"needs at least one view, not {views}", field="observer.views")
+    require_count("observer.views", views, "view")
+    if views > _MOST_VIEWS:
+        raise InputError(f"are {views}; give at most {_MOST_VIEWS}", field="observer.views")
+    for name, width in (("scan_deg", scan), ("fov_deg", fov)):
+        if not 0 < width <= math.pi:
+            raise InputError(
+                f"is {math.degrees(width):g} deg; give more than 0 and, since the wall's horizon lies there, up to 180 deg",
+                field=f"observer.{name}",
+            )
     if scan < fov:
         raise InputError(
             f"a scan of {math.degrees(scan):g} deg is narrower than one field of {math.degrees(fov):g} deg",
@@ -224,6 +237,8 @@ def wall_points(observer: Observer, tangents: ArrayLike | None = None) -> Array:
         Offsets t from the optical axis, any shape; the pixels' own positions when left out.
     """
     t = pixel_tangents(observer) if tangents is None else np.asarray(tangents, dtype=np.float64)
+    if not np.all(np.isfinite(t)):
+        raise InputError("hold a value that is not finite; a tangent of 90 deg meets no wall", field="tangents")
     x_o, y_o = observer.position
     view = np.asarray(observer.view_angles).reshape((-1,) + (1,) * t.ndim)
     x: Array = x_o + y_o * np.tan(view - np.arctan(t))
@@ -246,6 +261,12 @@ def require_finite(field: str, values: tuple[float, ...]) -> None:
     for value in values:
         if not math.isfinite(value):
             raise InputError(f"holds {value}; give finite numbers", field=field)
+
+
+def require_count(field: str, value: int, thing: str) -> None:
+    """Raise InputError naming the field unless the value is a whole number of things, at least one."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise InputError(f"needs at least one {thing}, a whole number, not {value}", field=field)
 
 
 def _require_lengths(field: str, places: tuple[float, ...] = (), *, distance: float = 1.0) -> None:

@@ -16,11 +16,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from wallmirror.arithmetic import power_of_two
 from wallmirror.brdf import AngleSumBRDF, Mirror
+from wallmirror.errors import InputError
 from wallmirror.geometry import Card, Observer, outgoing_angles, pixel_tangents, wall_points
 from wallmirror.scene import Room
 from wallmirror.transport import build_kernel, strip_factor
@@ -45,7 +48,14 @@ def from_card(observer: Observer, card: Card, brdf: AngleSumBRDF, source: Array)
         In 1/sr, its absolute scale counts here.
     source:
         V, shape (M, B).
+
+    Raises
+    ------
+    InputError
+        For a source of another shape or that is not finite.
     """
+    source = _checked_source(card, source)
+    observer, card = _scaled(observer, card, power_of_two(card.distance))
     nodes = _card_nodes(card)
     shape = (observer.views, observer.pixels, source.shape[1])
     if card.albedo == 0 or nodes is None:
@@ -87,7 +97,14 @@ def glow_in_mirror(card: Card, mirror: Mirror, source: Array) -> Array:
     ----------
     source:
         V, shape (M, B).
+
+    Raises
+    ------
+    InputError
+        For a source of another shape or that is not finite.
     """
+    source = _checked_source(card, source)
+    _, card = _scaled(None, card, power_of_two(card.distance))
     nodes = _card_nodes(card)
     if card.albedo == 0 or nodes is None:
         return np.zeros(source.shape)
@@ -112,6 +129,31 @@ def glow_in_mirror(card: Card, mirror: Mirror, source: Array) -> Array:
     level = np.zeros(seen_x.size)
     glow = lit(seen_x, level, strip_x, strip_h, strip_area) @ emitted + lit(seen_x, level, x, h, area) @ board
     return np.asarray(np.tensordot(shares / 2, glow.reshape(strips.size, at.size, -1), axes=(0, 1)), dtype=np.float64)
+
+
+def _checked_source(card: Card, source: ArrayLike) -> Array:
+    """V as float64, (M, B), finite."""
+    array = np.asarray(source, dtype=np.float64)
+    if array.ndim != 2 or array.shape[0] != card.elements:
+        raise InputError(
+            f"has shape {array.shape}; give one row for each of the {card.elements} elements, (M, B)", field="source"
+        )
+    if not np.all(np.isfinite(array)):
+        raise InputError("holds a value that is not finite", field="source")
+    return array
+
+
+def _scaled(observer: Observer | None, card: Card, unit: float) -> tuple[Any, Card]:
+    """Camera and card with lengths in another unit: radiances do not know it, and fourth powers stay in float64's range."""
+    lengths = ("y", "element_width", "element_height", "board_width", "board_height")
+    smaller = replace(
+        card,
+        elements_x=tuple(x / unit for x in card.elements_x),
+        **{name: getattr(card, name) / unit for name in lengths},
+    )
+    if observer is not None:
+        observer = replace(observer, position=(observer.position[0] / unit, observer.position[1] / unit))
+    return observer, smaller
 
 
 @dataclass(frozen=True)
@@ -191,12 +233,23 @@ def from_room(observer: Observer, card: Card, room: Room, brdf: AngleSumBRDF, so
 
     Strips light the patches directly and over the wall; patches light each other (radiosity), directly and over the
     wall, and then the wall. The card casts no shadow here.
+
+    Raises
+    ------
+    InputError
+        For a source of another shape or that is not finite.
     """
+    source = _checked_source(card, source)
     if room.albedo == 0:
         return np.zeros((observer.views, observer.pixels, source.shape[1]))
+    unit = power_of_two(room.depth)
+    strip_area = 1.0 / unit / unit if card.is_points else card.element_width / unit * (card.element_height / unit)
+    observer, card = _scaled(observer, card, unit)
+    room = replace(
+        room, half_width=room.half_width / unit, half_height=room.half_height / unit, depth=room.depth / unit
+    )
     patches = _room_patches(room)
     strips = np.stack([np.asarray(card.elements_x), np.full(card.elements, card.y), np.zeros(card.elements)], axis=1)
-    strip_area = 1.0 if card.is_points else card.element_width * card.element_height
     lit = _exchange(patches, strips, np.array([0.0, 1.0, 0.0])) * strip_area
     lit = lit + _strips_over_wall(patches, strips, strip_area, room, brdf)
     among = _exchange(patches, patches.centre, patches.normal) * patches.area

@@ -25,6 +25,10 @@ _BLOCK_BYTES = 4e6
 _PICTURE_ARRAYS, _PATH_BYTES = 7, 64e6
 # The films, normalised, weighted, and in their QR factorisation.
 _FILM_ARRAYS = 6
+# A solution: films of the problem and of its fits, cubic splines and their dense windows, and what does not grow.
+_SOLUTION_ARRAYS, _ELEMENT_ARRAYS, _SOLUTION_BYTES = 8.5, 24, 20e6
+# Bytes of an entry of T_i^T W T_j while it is made and for as long as it is held; a bound on the entries is 1.4 times them.
+_ENTRY_MADE, _ENTRY_HELD = 36, 19
 # Beside degree + 1 basis functions at all nodes: their sums and places, and one element's share with the weight.
 _NODE_ARRAYS = 8
 # Squares of the number of knots: Fisher information, its factors, and the covariance that follows.
@@ -97,6 +101,17 @@ def design_bytes(views: int, pixels: int, elements: int, nodes: int, *, degree: 
     return float(_FLOAT) * (
         views * pixels * float(elements) * nodes * (degree + _NODE_ARRAYS) + float(_KNOT_SQUARES) * knots**2
     )
+
+
+def solution_bytes(views: int, pixels: int, elements: int, realisations: int) -> float:
+    """Peak of solving a capture set but for its pairs of elements (`pairs_bytes`): films, and matrices over the pixels."""
+    per_pixel = _SOLUTION_ARRAYS * realisations + _ELEMENT_ARRAYS * elements
+    return float(_FLOAT) * views * pixels * per_pixel + _SOLUTION_BYTES
+
+
+def pairs_bytes(entries: int, weights: int) -> float:
+    """Peak of T_i^T W T_j of all pairs with so many entries at most, for so many different W, and of their use."""
+    return float(entries) * (_ENTRY_MADE + _ENTRY_HELD * (weights - 1))
 
 
 def picture_bytes(width: int, height: int) -> float:

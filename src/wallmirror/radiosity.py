@@ -37,6 +37,8 @@ Array = NDArray[np.float64]
 FACES = ("x0", "x1", "y0", "y1", "z0", "z1")
 Face = Literal["x0", "x1", "y0", "y1", "z0", "z1"]
 _MOST_PATCHES = 3000
+_MOST_SLENDER = 100
+_MOST_TERMS = 10**5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +53,12 @@ class Box:
         n; patches are numbered face by face in the order of `FACES`, P = 6 n^2 of them.
     open_faces:
         Faces that are not there: light that meets them is lost.
+
+    Raises
+    ------
+    InputError
+        For lengths beyond 1e-6 to 1e6 or more than a hundred times one another, fewer than 1 or more than 3000 patches, or a
+        box whose faces are all open.
 
     Examples
     --------
@@ -67,12 +75,20 @@ class Box:
     face: NDArray[np.intp] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        if len(self.size) != 3:
+            raise InputError(f"is {self.size}; give three lengths", field="size")
         for length in self.size:
             require_range("size", length, 1e-6, 1e6)
+        if max(self.size) > _MOST_SLENDER * min(self.size):
+            raise InputError(
+                f"is {self.size}; give lengths at most {_MOST_SLENDER} times one another, since the closed forms cancel in "
+                "boxes more slender than that",
+                field="size",
+            )
         present = [k for k, name in enumerate(FACES) if name not in self.open_faces]
-        if len(present) + len(set(self.open_faces)) != len(FACES):
-            raise InputError(f"are {self.open_faces}; name faces among {', '.join(FACES)}", field="open_faces")
-        if self.cells < 1 or len(present) * self.cells**2 > _MOST_PATCHES:
+        if len(present) + len(set(self.open_faces)) != len(FACES) or not present:
+            raise InputError(f"are {self.open_faces}; name faces among {', '.join(FACES)}, not all", field="open_faces")
+        if int(self.cells) != self.cells or self.cells < 1 or len(present) * self.cells**2 > _MOST_PATCHES:
             raise InputError(f"is {self.cells}; give 1 to {int((_MOST_PATCHES / 6) ** 0.5)}", field="cells")
         low, high, face = [], [], []
         i, j = (g.ravel() for g in np.meshgrid(*(np.arange(self.cells),) * 2, indexing="ij"))
@@ -103,7 +119,10 @@ class Box:
         return np.where(self.face == FACES.index(face), inside, outside)
 
     def form_factors(self) -> Array:
-        """F, shape (P, P): the share of the light from each patch (row) that meets each other patch (column)."""
+        """F, shape (P, P): the share of the light from each patch (row) that meets each other patch (column).
+
+        Known to a few eps times the square of cells times slenderness, what cancels in the closed forms.
+        """
         exchange = np.zeros((self.face.size, self.face.size))
         for k in np.unique(self.face):
             for m in np.unique(self.face):
@@ -112,7 +131,7 @@ class Box:
                     block = self._exchange(rows, columns, k // 2, m // 2)
                     exchange[np.ix_(rows, columns)] = block
                     exchange[np.ix_(columns, rows)] = block.T
-        return exchange / self.areas[:, None]
+        return np.maximum(exchange, 0.0) / self.areas[:, None]
 
     def _exchange(self, rows: NDArray[np.intp], columns: NDArray[np.intp], k: int, m: int) -> Array:
         """A_i F_ij between the patches of two faces across the axes k and m."""
@@ -147,12 +166,19 @@ def transport_operator(form_factors: ArrayLike, albedo: ArrayLike) -> Array:
     Raises
     ------
     InputError
-        For an albedo that is negative or not finite; one above 1 is allowed, to show what it does.
+        For form factors or albedos that are negative, not finite or of another shape; an albedo above 1 is allowed, to show
+        what it does.
     """
     factors = np.asarray(form_factors, dtype=np.float64)
-    albedos = np.broadcast_to(np.asarray(albedo, dtype=np.float64), factors.shape[:1])
-    if not np.all(np.isfinite(albedos)) or albedos.min() < 0:
-        raise InputError("holds a value that is negative or not finite", field="albedo")
+    albedos = np.asarray(albedo, dtype=np.float64)
+    for name, values in (("form_factors", factors), ("albedo", albedos)):
+        if not np.all(np.isfinite(values)) or values.min(initial=0.0) < 0:
+            raise InputError("holds a value that is negative or not finite", field=name)
+    if factors.ndim != 2 or albedos.shape not in ((), factors.shape[:1]):
+        raise InputError(
+            f"has shape {albedos.shape}; give one, or one for each row of F {factors.shape}", field="albedo"
+        )
+    albedos = np.broadcast_to(albedos, factors.shape[:1])
     return np.asarray(albedos[:, None] * factors, dtype=np.float64)
 
 
@@ -165,7 +191,7 @@ class NeumannSeries:
     partial_sums:
         L_e + T L_e + ... + T^k L_e for k = 0 to K, shape (K + 1, P).
     exact:
-        (1 - T)^-1 L_e, shape (P,).
+        (1 - T)^-1 L_e, shape (P,); the limit only where the spectral radius is below 1.
     largest_factor:
         The norm of T that energy bounds: its largest row sum, |T| in the norm of the largest radiance.
     spectral_radius:
@@ -179,9 +205,9 @@ class NeumannSeries:
 
     @property
     def errors(self) -> Array:
-        """Largest error of each partial sum over the largest radiance, shape (K + 1,)."""
+        """Largest error of each partial sum over the largest radiance, shape (K + 1,); 0 in the dark."""
         apart = np.abs(self.partial_sums - self.exact).max(axis=1)
-        return np.asarray(apart / np.abs(self.exact).max(), dtype=np.float64)
+        return np.asarray(apart / (np.abs(self.exact).max() or 1.0), dtype=np.float64)
 
     @property
     def ratio(self) -> float:
@@ -206,7 +232,8 @@ def neumann_series(operator: ArrayLike, emitted: ArrayLike, terms: int) -> Neuma
     Raises
     ------
     InputError
-        If a matrix of another shape is given, or 1 - T is singular: then light has no steady state.
+        If a matrix of another shape or values that are not finite are given, or 1 - T is singular: then light has no steady
+        state.
 
     Examples
     --------
@@ -217,8 +244,10 @@ def neumann_series(operator: ArrayLike, emitted: ArrayLike, terms: int) -> Neuma
     ([2.0, 2.0, 2.0, 2.0, 2.0, 2.0], 0.5)
     """
     matrix, source = np.asarray(operator, dtype=np.float64), np.asarray(emitted, dtype=np.float64)
-    if matrix.shape != (source.size, source.size) or source.ndim != 1:
+    if matrix.shape != (source.size, source.size) or source.ndim != 1 or source.size == 0:
         raise InputError(f"has shape {matrix.shape}; give one row and column a patch", field="operator")
+    if not (isinstance(terms, (int, np.integer)) and 0 <= terms <= _MOST_TERMS):
+        raise InputError(f"is {terms}; give a whole number from 0 to {_MOST_TERMS}", field="terms")
     if not np.all(np.isfinite(matrix)) or matrix.min() < 0:
         raise InputError("holds a value that is negative or not finite", field="operator")
     radius = float(np.max(np.abs(np.linalg.eigvals(matrix))))
@@ -228,12 +257,17 @@ def neumann_series(operator: ArrayLike, emitted: ArrayLike, terms: int) -> Neuma
             f"keeps all of the light (spectral radius {radius:.12g}): the sum has no limit; let some of it be absorbed",
             field="operator",
         )
+    if not np.all(np.isfinite(source)):
+        raise InputError("holds a value that is not finite", field="emitted")
     sums = np.empty((terms + 1, source.size))
     term = sums[0] = source
-    for k in range(1, terms + 1):
-        term = matrix @ term
-        sums[k] = sums[k - 1] + term
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in range(1, terms + 1):
+            term = matrix @ term
+            sums[k] = sums[k - 1] + term
     limit = np.asarray(np.linalg.solve(system, source), dtype=np.float64)
+    if not (np.all(np.isfinite(limit)) and np.all(np.isfinite(sums))):
+        raise InputError("holds a value whose sum leaves the range of float64; use other units", field="emitted")
     return NeumannSeries(sums, limit, float(matrix.sum(axis=1).max()), radius)
 
 

@@ -27,6 +27,10 @@ class Wall:
     half_width: float = 20.0
     half_height: float = 20.0
 
+    def __post_init__(self) -> None:
+        for name in ("half_width", "half_height"):
+            _require_length(f"wall.{name}", getattr(self, name))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Room:
@@ -39,6 +43,12 @@ class Room:
     half_height: float
     depth: float
     albedo: float
+
+    def __post_init__(self) -> None:
+        for name in ("half_width", "half_height", "depth"):
+            _require_length(f"room.{name}", getattr(self, name))
+        if not 0 <= self.albedo < 1:
+            raise InputError(f"is {self.albedo:g}; an albedo lies in [0, 1)", field="room.albedo")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +104,12 @@ class Scene:
     def is_one_bounce(self) -> bool:
         """Whether nothing but the wall reflects light, so that Hypothesis 2 holds exactly."""
         return self.room is None and self.card.albedo == 0
+
+
+def _require_length(field: str, value: float) -> None:
+    """Raise InputError naming the field unless the value is a length whose fourth power float64 holds beside others."""
+    if not 1e-100 <= value <= 1e100:
+        raise InputError(f"is {value:g}; give a length > 0 in metres", field=field)
 
 
 def _require_inside(room: Room, card: Card, observer: Observer) -> None:

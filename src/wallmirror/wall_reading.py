@@ -20,16 +20,9 @@ columns theta_o.
 
 from __future__ import annotations
 
-import io
 import math
-import warnings
 from collections.abc import Callable
-from pathlib import Path
-from tokenize import TokenError
-from typing import Any, get_args
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import get_args
 
 from wallmirror.brdf import (
     BRDF,
@@ -51,24 +44,9 @@ from wallmirror.brdf import (
     Sum,
     Table,
 )
-from wallmirror.errors import InputError, shown
+from wallmirror.errors import InputError
 from wallmirror.fields import Fields
-from wallmirror.files import read_bounded
-
-_MOST_BYTES = 2**26  # of a file
-_MOST_NUMBERS = 2**25
-# NumPy reads a .npy header as Python, and lets through what Python's tokenizer and parser raise.
-_FAULTS = (
-    ValueError,
-    TypeError,
-    EOFError,
-    OverflowError,
-    UserWarning,
-    SyntaxError,
-    RecursionError,
-    MemoryError,
-    TokenError,
-)
+from wallmirror.table_files import read_table
 
 
 def read_brdf(fields: Fields) -> BRDF:
@@ -132,7 +110,7 @@ def _gaussian_train(fields: Fields) -> GaussianTrain:
 def _table(fields: Fields) -> AngleSumTable | Table:
     path = fields.inside("file", "scene's")
     try:
-        values = _numbers(path)
+        values = read_table(path)
         if values.ndim == 2 and min(values.shape) > 1:
             return Table(values=values)
         return AngleSumTable(
@@ -144,43 +122,6 @@ def _table(fields: Fields) -> AngleSumTable | Table:
         if error.field not in (None, "wall.table"):
             raise
         raise fields.error("file", f'"{path.name}" {error.message}') from None
-
-
-def _numbers(path: Path) -> NDArray[np.float64]:
-    """The array of a .npy or .csv file of real numbers."""
-    if path.suffix not in (".npy", ".csv"):
-        raise InputError("is neither a .npy nor a .csv file")
-    content = read_bounded(path, _MOST_BYTES)
-    try:
-        values = _npy(content) if path.suffix == ".npy" else _csv(content)
-    except _FAULTS as error:
-        raise InputError(f"cannot be read as a table of numbers ({shown(str(error), quote=False)})") from None
-    if values.dtype.kind not in "fiu" or values.ndim not in (1, 2):
-        kind, shape = shown(str(values.dtype), quote=False), shown(values.shape)
-        raise InputError(f"holds {kind} of shape {shape}; give real numbers in one or two dimensions")
-    return values.astype(np.float64)
-
-
-def _npy(content: bytes) -> NDArray[Any]:
-    """The array of a .npy file, whose header is judged by the file's length before NumPy allocates what it states."""
-    stream = io.BytesIO(content)
-    version = np.lib.format.read_magic(stream)
-    reader = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = reader(stream)
-    if dtype.hasobject or min(shape, default=0) < 0:
-        raise ValueError(f"it holds {dtype} of shape {shape}")
-    rest = len(content) - stream.tell()
-    if math.prod(shape) * dtype.itemsize > rest or math.prod(shape) > _MOST_NUMBERS:
-        raise ValueError(f"its header states {math.prod(shape)} numbers, but {rest} bytes follow, or it is too large")
-    stream.seek(0)
-    values: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
-    return values
-
-
-def _csv(content: bytes) -> NDArray[Any]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)  # a file without numbers
-        return np.loadtxt(io.StringIO(content.decode("utf-8")), delimiter=",", ndmin=2, dtype=np.float64)
 
 
 _MODELS: dict[str, Callable[[Fields], BRDF]] = {

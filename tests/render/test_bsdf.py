@@ -642,7 +642,7 @@ def test_text_that_is_no_table_is_refused(text: str, told: str) -> None:
 
 
 def test_files_that_are_no_table_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="cannot be read"):
+    with pytest.raises(ValueError, match="no such file"):
         loaded_table(tmp_path / "missing.npy")
     (tmp_path / "text.npy").write_text("1 2 3")
     np.save(tmp_path / "pickle.npy", np.array([{}, 1], dtype=object), allow_pickle=True)
@@ -652,6 +652,12 @@ def test_files_that_are_no_table_are_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "complex.npy", np.ones(3, dtype=complex))
     with pytest.raises(ValueError, match="complex"):
         loaded_table(tmp_path / "complex.npy")
+    # A header may state what no file of that length holds: it is judged before anything is allocated.
+    vast = tmp_path / "vast.npy"
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({2**40}, {2**20}), }}".encode().ljust(117) + b"\n"
+    vast.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + b"\0" * 32)
+    with pytest.raises(ValueError, match="its header states"):
+        loaded_table(vast)
 
 
 @pytest.mark.parametrize(
@@ -660,7 +666,7 @@ def test_files_that_are_no_table_are_refused(tmp_path: Path) -> None:
         ({}, "the scene gives none"),
         ({"values": "1 1", "filename": "x.npy"}, "one of table, values and filename"),
         ({"values": "1 -1"}, "-1 at node 1"),
-        ({"filename": "missing.npy"}, "missing.npy cannot be read"),
+        ({"filename": "missing.npy"}, "missing.npy: no such file"),
     ],
 )
 def test_a_scene_with_a_bad_table_is_refused(mi: Any, given: dict[str, str], told: str) -> None:

@@ -141,8 +141,8 @@ def test_four_positions_suffice_with_reciprocity() -> None:
     assert reciprocal.predicted_error < free.predicted_error
     # Imposed on a wall with a nap, reciprocity is wrong, and the certificate says so.
     combed = captured(4, Combed())
-    assert general._exact(Stack.of(combed, True), (8.0,), lambda _: None)[2].mismatch > 1e-5
-    assert general._exact(Stack.of(combed, False), (8.0,), lambda _: None)[2].mismatch < 1e-7
+    assert general._exact(Stack.of(combed, True), (8.0,), lambda _: None).closed.mismatch > 1e-5
+    assert general._exact(Stack.of(combed, False), (8.0,), lambda _: None).closed.mismatch < 1e-7
 
 
 @pytest.mark.parametrize(("positions", "reciprocal"), [(16, False), (4, True)])

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from wallmirror.captures import CaptureSet
-from wallmirror.derendering.finer import Films, Finer, score, worth
+from wallmirror.derendering.finer import Films, Finer, loss, score, worth
+from wallmirror.derendering.information import information
 from wallmirror.derendering.likelihood import Fit, maximise, moments
 from wallmirror.derendering.solve import solve
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
@@ -66,16 +67,20 @@ def test_moments_of_coarse_knots_follow_from_those_of_finer_ones(columns: int) -
     data = noisy(sigma_deg=6, noise=0.01, seed=0)
     weights = np.broadcast_to(10.0 ** np.random.default_rng(1).uniform(-1, 1, (data.shape[0], columns)), data.shape)
     there = moments(data, coarse, weights)  # type: ignore[arg-type]
-    back = moments(data, fine, weights).coarsened(grid.in_halved())  # type: ignore[arg-type]
+    finer = moments(data, fine, weights)  # type: ignore[arg-type]
+    halved = grid.in_halved().toarray()
     r, v = np.random.default_rng(2).random(grid.size), np.random.default_rng(4).random((7, 3))
+    band = finer.pairs[0].band
+    total = sum(np.diag(row[: row.size - d], -d) for d, row in enumerate(band))
+    total = total + np.tril(total, -1).T
     for a, b in [
-        (back.cross, there.cross),
-        (back.exposure, there.exposure),
-        (back.gram_of_source(v), there.gram_of_source(v)),
-        (back.pairs[0].times(r), there.pairs[0].times(r)),
+        (finer.cross @ halved, there.cross),
+        (halved.T @ finer.gram_of_source(v) @ halved, there.gram_of_source(v)),
+        (finer.pairs[0].times(halved @ r) @ halved, there.pairs[0].times(r)),
+        (np.diag(halved.T @ total @ halved), there.pairs[0].band[0]),
     ]:
         np.testing.assert_allclose(a, b, atol=1e-13 * np.max(np.abs(b)), rtol=0)  # sums of some 400 rows
-    assert len(back.pairs) == columns
+    assert len(there.pairs) == columns
 
 
 # -- the score test -------------------------------------------------------------------------------------------------
@@ -154,6 +159,45 @@ def test_knots_that_are_fine_enough_pass_at_the_rate_of_the_test() -> None:
     # The twin: a lobe that these knots cannot follow passes every time.
     rough, _, _ = by_score(noisy(sigma_deg=4, noise=0.01, seed=0), np.full((clean.shape[0], 1), noise**-2), 16.0)
     assert rough.gain > 2 * prices[-1]
+
+
+def test_a_search_that_noise_explains_ends_early_and_no_other() -> None:
+    """What is out of reach ends the search a few steps before it would settle, with nearly all of the gain."""
+    grid, coarse, fine = nested(8.0)
+    data = noisy(sigma_deg=6, noise=0.02, seed=1)
+    best = maximise(moments(data, coarse), grid.interpolate(lobes(sigma_deg=6).of_sum), nonnegative=False)  # type: ignore[arg-type]
+    transport = np.stack([t @ best.coefficients for t in coarse], axis=1)  # type: ignore[operator]
+    films = Films(data, np.ones((data.shape[0], 1)), transport, best.source)
+
+    def gain(least: float) -> float:
+        every = np.ones(grid.halved().size, dtype=bool)
+        found = score(films, fine, banded_gram(fine), every, enough=math.inf, least=lambda _: least)  # type: ignore[arg-type]
+        return found.gain
+
+    whole = gain(0.0)
+    assert 0.9 * whole < gain(1.5 * whole) < whole
+    assert gain(1.02 * whole) > 0.98 * whole  # near the price the search goes on
+    assert gain(0.9 * whole) == whole
+
+
+@pytest.mark.parametrize("columns", [1, 7], ids=["weights alike", "weights of each realisation"])
+def test_what_coarser_knots_lose_is_foretold(columns: int) -> None:
+    grid, coarse, fine = nested(8.0)
+    data = noisy(sigma_deg=6, noise=0.02, seed=1)
+    weights = 10.0 ** np.random.default_rng(1).uniform(-0.5, 0.5, (data.shape[0], columns))
+    everywhere = np.broadcast_to(weights, data.shape)
+    halved = grid.in_halved()
+    start = grid.interpolate(lobes(sigma_deg=6).of_sum)
+    finer = moments(data, fine, everywhere)  # type: ignore[arg-type]
+    best = maximise(finer, halved @ start, nonnegative=False, tolerance=1e-12)
+    least = maximise(moments(data, coarse, everywhere), start, nonnegative=False, tolerance=1e-12)  # type: ignore[arg-type]
+    pull = np.einsum("ib,bik->k", best.source, finer.cross)
+    schur = information(finer, best.coefficients, best.source).schur
+    lost = loss(schur, best.coefficients, pull, halved)
+    # The misfit is nearly quadratic between the two maxima.
+    assert lost == pytest.approx(least.objective - best.objective, rel=0.1)
+    # The planted fault: with nothing to hold the scale, nothing would seem lost.
+    assert loss(schur, best.coefficients, 1e-9 * pull, halved) < 1e-3 * lost
 
 
 def test_the_price_allows_for_noise_that_few_data_tell() -> None:

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from wallmirror.brdf import Diffuse, GaussianTrain
 from wallmirror.geometry import Card, Observer, pixel_half_width
+from wallmirror.quadrature import gauss_legendre, order_across_peak
 from wallmirror.transport import Kernel, build_kernel
 from wallmirror.transport.nodes import Nodes
 
-from .helpers import same_examples
+from .helpers import refused, same_examples
 
 Array = NDArray[np.float64]
 
@@ -237,3 +238,28 @@ def test_a_tolerance_asked_of_a_midpoint_rule_is_not_kept(monkeypatch: pytest.Mo
     assert abs(float(even.apply(brdf)[0, 5, 0]) - exact) > 2e-6 * brightest
     fewer = Kernel(*Nodes(observer, card, "physical", half, card.element_width / 2).all_at_once((4, nodes // 4)))
     assert abs(float(fewer.apply(brdf)[0, 5, 0]) - exact) > 10 * 2e-6 * brightest
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-9, 1e-12])
+@pytest.mark.parametrize("width", [0.1, 1.0, 10.0, 25.0])
+def test_the_order_across_a_peak_is_that_of_its_poles(tolerance: float, width: float) -> None:
+    # 1 / (1 + x^2) and its square in closed form; the square's double pole costs a small factor, half the order a large one.
+    order = order_across_peak(width, tolerance)
+
+    def missed(nodes: int, power: int) -> float:
+        x, weights = gauss_legendre(nodes)
+        worst = 0.0
+        for centre in np.linspace(0, width, 17):
+            ends = centre + width / 2 * np.array([-1.0, 1.0])
+            whole = np.arctan(ends) if power == 1 else 0.5 * (np.arctan(ends) + ends / (1 + ends**2))
+            found = 0.5 * float(np.sum(weights / (1 + (centre + width / 2 * x) ** 2) ** power))
+            worst = max(worst, abs(found - float(whole[1] - whole[0]) / width))
+        return worst
+
+    assert missed(order, 1) <= tolerance
+    assert missed(order, 2) <= 3 * tolerance
+    assert missed(order // 2, 1) > 10 * tolerance
+
+
+def test_a_peak_that_no_order_resolves_is_refused() -> None:
+    assert "as wide as the card is far" in str(refused(lambda: order_across_peak(1e3, 1e-9)))

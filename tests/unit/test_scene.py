@@ -183,7 +183,7 @@ FAULTS = {
     "views as fraction": ("views = 3", "views = 3.5", "observer.views", "whole number"),
     "views missing": ("views = 3\n", "", "observer.views", "is missing"),
     "scan too narrow": ("scan_deg = 90.0", "scan_deg = 50.0", "observer.scan_deg", "narrower"),
-    "scan past the horizon": ("scan_deg = 90.0", "scan_deg = 181.0", "observer.view_angles_deg", "horizon"),
+    "scan past the horizon": ("scan_deg = 90.0", "scan_deg = 181.0", "observer.scan_deg", "horizon"),
     "listed view past the horizon": (
         "views = 3\nscan_deg = 90.0",
         "view_angles_deg = [0, 60.5]",

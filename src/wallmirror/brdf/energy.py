@@ -40,9 +40,12 @@ def directional_albedos(brdf: BRDF, incidence: ArrayLike, *, finer: int = 1) -> 
     Raises
     ------
     InputError
-        If the model changes within less than 6e-6 rad, which the quadrature cannot resolve.
+        If the model changes within less than 6e-6 rad, which the quadrature cannot resolve, or an angle lies beyond the
+        horizon.
     """
     angles = np.asarray(incidence, dtype=np.float64)
+    if not np.all(np.abs(angles) <= math.pi / 2):
+        raise InputError("holds an angle beyond the horizon; give radians from -pi/2 to pi/2", field="incidence")
     if isinstance(brdf, Mirror):
         return np.full(angles.shape, brdf.reflectance)
     if math.pi / brdf.angular_scale > _MOST_PANELS:

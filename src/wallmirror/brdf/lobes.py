@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import betainc
+from scipy.special import beta, betainc
 
 from wallmirror.brdf.base import BRDF, AngleSumBRDF, Array, LobeForm, require_choice, require_range
 from wallmirror.errors import InputError
@@ -20,6 +21,9 @@ _NOTHING = float(np.exp(_FAR))
 LobeHeight = Literal["peak", "per_degree", "per_radian"]
 
 _MAX_EXPONENT = 1e8
+_LEAST_COSINE = 1e-15
+#: Of Gamma(a + 1/2) / (Gamma(a) sqrt(a)).
+_GAMMA_QUOTIENT = (1, -1 / 8, 1 / 128, 5 / 1024, -21 / 32768, -399 / 262144, 869 / 4194304)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +37,7 @@ class Diffuse(AngleSumBRDF):
 
     def of_sum(self, u: ArrayLike) -> Array:
         """Value in 1/sr at angle sums u in radians, same shape."""
-        return np.full(np.shape(u), self.albedo / math.pi)
+        return np.where(np.isnan(np.asarray(u, dtype=np.float64)), np.nan, self.albedo / math.pi)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +51,12 @@ class Mirror(BRDF):
 
     def __post_init__(self) -> None:
         require_range("wall.reflectance", self.reflectance, 0, 1)
+
+    def __call__(self, theta_s: ArrayLike, theta_o: ArrayLike) -> Array:
+        """Refused: a delta has no values."""
+        raise InputError(
+            "is a mirror, a delta without values; `transport_matrix` renders it exactly", field="wall.brdf"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,15 +86,14 @@ class Phong(AngleSumBRDF):
 
     def of_sum(self, u: ArrayLike) -> Array:
         """Value in 1/sr at angle sums u in radians, same shape."""
-        u = np.asarray(u, dtype=np.float64)
-        front = np.abs(u) < math.pi / 2
-        power = np.where(front, np.cos(u), 1.0) ** self.exponent
-        return np.where(front, self._peak() * power, 0.0)
+        u = np.abs(np.asarray(u, dtype=np.float64))
+        power = _power_of_cosine(np.minimum(u, math.pi / 2), self.exponent)
+        return np.where(u >= math.pi / 2, 0.0, self._peak() * power)
 
     def _peak(self) -> float:
         if self.form == "plain":
             return self.reflectance
-        return self.reflectance / (math.pi / 2) * math.exp(-_log_beta_half(self.exponent / 2 + 1))
+        return self.reflectance / (math.pi / 2) / _beta_half(self.exponent / 2 + 1)
 
     @property
     def angular_scale(self) -> float:
@@ -109,9 +118,11 @@ class PhongIllumination(BRDF):
         require_range("wall.specular", self.specular, 0, 1)
 
     def __call__(self, theta_s: ArrayLike, theta_o: ArrayLike) -> Array:
-        """Value in 1/sr, broadcast over two arrays of angles in radians."""
+        """Value in 1/sr, broadcast over two arrays of angles in radians; 0 for light from below the horizon."""
         lobe = Phong(exponent=self.exponent, reflectance=self.specular, form="plain")
-        return lobe(theta_s, theta_o) / np.cos(np.asarray(theta_s, dtype=np.float64))
+        tilt = np.abs(np.asarray(theta_s, dtype=np.float64))
+        # A rounded angle of 90 deg lies a little above the horizon, as its cosine says.
+        return np.where(tilt > math.pi / 2, 0.0, lobe(theta_s, theta_o) / np.cos(np.minimum(tilt, math.pi / 2)))
 
     @property
     def angular_scale(self) -> float:
@@ -147,7 +158,7 @@ class Blinn(AngleSumBRDF):
     def of_sum(self, u: ArrayLike) -> Array:
         """Value in 1/sr at angle sums u in radians, same shape."""
         half = np.minimum(np.abs(np.asarray(u, dtype=np.float64)) / 2, math.pi / 2)
-        return np.asarray(self._peak() * np.maximum(np.cos(half), 0.0) ** self.exponent, dtype=np.float64)
+        return np.asarray(self._peak() * _power_of_cosine(half, self.exponent), dtype=np.float64)
 
     def _peak(self) -> float:
         if self.form == "plain":
@@ -197,9 +208,14 @@ class GaussianTrain(AngleSumBRDF):
         if not (math.isfinite(self.sigma) and self.sigma > 0):
             raise InputError(f"is {math.degrees(self.sigma):g}; give a width > 0", field="wall.sigma_deg")
         require_choice("wall.height", self.height, get_args(LobeHeight))
-        require_range("wall.scale", self.scale, 0, math.inf)
+        require_range("wall.scale", self.scale, 0, sys.float_info.max)
         if not math.isfinite(self._peak()):
             raise InputError(f"is {math.degrees(self.sigma):g}, too narrow for a finite height", field="wall.sigma_deg")
+        if not math.isfinite(self._peak() * len(self.centres)):
+            raise InputError(
+                f"is {self.scale:g}, too large for the sum of {len(self.centres)} lobes; use other units",
+                field="wall.scale",
+            )
 
     @classmethod
     def of_the_text(cls) -> GaussianTrain:
@@ -253,6 +269,11 @@ class Sum(AngleSumBRDF):
 
     parts: tuple[AngleSumBRDF, ...]
 
+    def __post_init__(self) -> None:
+        if not all(isinstance(part, AngleSumBRDF) for part in self.parts):
+            raise InputError("holds a model that is no function of the angle sum; use a GeneralSum", field="wall.parts")
+        _require_parts(self.parts)
+
     def of_sum(self, u: ArrayLike) -> Array:
         """Value in 1/sr at angle sums u in radians, same shape."""
         total = np.zeros(np.shape(u))
@@ -271,6 +292,9 @@ class GeneralSum(BRDF):
     """The sum of any models with finite values, e.g. microfacets over a diffuse ground."""
 
     parts: tuple[BRDF, ...]
+
+    def __post_init__(self) -> None:
+        _require_parts(self.parts)
 
     def __call__(self, theta_s: ArrayLike, theta_o: ArrayLike) -> Array:
         """Value in 1/sr, broadcast over two arrays of angles in radians."""
@@ -291,12 +315,31 @@ def _require_lobe(exponent: float, reflectance: float, form: str) -> None:
     require_choice("wall.form", form, get_args(LobeForm))
 
 
-def _log_beta_half(a: float) -> float:
-    """Logarithm of the beta function B(a, 1/2)."""
-    return math.lgamma(a) + math.lgamma(0.5) - math.lgamma(a + 0.5)
+def _require_parts(parts: tuple[BRDF, ...]) -> None:
+    if not parts or any(isinstance(part, Mirror) for part in parts):
+        raise InputError(
+            "needs at least one model, and none that is a mirror: a delta has no values", field="wall.parts"
+        )
+
+
+def _power_of_cosine(angle: Array, exponent: float) -> Array:
+    """cos(angle)^n for angles from 0 to pi/2, to some ten eps of the peak: a rounded cosine near 1 is off by n / 2 eps."""
+    if exponent <= 64:
+        return np.asarray(np.cos(angle) ** exponent, dtype=np.float64)
+    fall = np.minimum(2 * np.sin(0.5 * angle) ** 2, 1 - _LEAST_COSINE)  # 1 - cos
+    return np.asarray(np.exp(exponent * np.log1p(-fall)), dtype=np.float64)
+
+
+def _beta_half(a: float) -> float:
+    """The beta function B(a, 1/2) for a >= 1/2, to a few eps: log gammas of a large a would cancel."""
+    if a < 100:
+        return float(beta(a, 0.5))
+    # sqrt(pi) Gamma(a) / Gamma(a + 1/2), by the series of the quotient in 1/a (Tricomi and Erdelyi 1951).
+    quotient = np.polynomial.polynomial.polyval(1 / a, _GAMMA_QUOTIENT)
+    return math.sqrt(math.pi / a) / float(quotient)
 
 
 def _cosine_power(m: float) -> float:
     """int_0^(pi/4) cos(t)^m dt = B(1/2, b) I_1/2(1/2, b) / 2 with b = (m + 1) / 2."""
     b = (m + 1) / 2
-    return float(0.5 * math.exp(_log_beta_half(b)) * betainc(0.5, b, 0.5))
+    return float(0.5 * _beta_half(b) * betainc(0.5, b, 0.5))

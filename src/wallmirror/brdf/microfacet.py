@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -60,10 +60,16 @@ class Fresnel:
     def __call__(self, cosine: ArrayLike) -> Array:
         """Share reflected for cosines of incidence from 0 to 1, same shape."""
         cosine = np.asarray(cosine, dtype=np.float64)
-        n2 = complex(self.eta, self.k) ** 2
-        bent = np.sqrt(n2 - (1 - cosine**2))  # n cos of the refracted angle, by Snell's law
-        across = np.abs((cosine - bent) / (cosine + bent)) ** 2
-        along = np.abs((n2 * cosine - bent) / (n2 * cosine + bent)) ** 2
+        n = complex(self.eta, self.k)
+        n2, jump = n**2, (n - 1) * (n + 1)
+        if jump == 0:  # no surface at all
+            return np.where(np.isnan(cosine), np.nan, 0.0)
+        square, sine = cosine**2, (1 - cosine) * (1 + cosine)  # of the cosine, and sin^2
+        # n cos of the refracted angle by Snell's law, n^2 - sin^2 in the form that does not cancel.
+        bent = np.sqrt(np.where(square < 0.5, jump + square, n2 - sine))
+        with np.errstate(invalid="ignore"):  # of NaN
+            across = np.abs(_contrast(cosine, bent, -jump)) ** 2
+            along = np.abs(_contrast(n2 * cosine, bent, jump * (n2 * square - sine))) ** 2
         return np.asarray((across + along) / 2, dtype=np.float64)
 
 
@@ -116,14 +122,14 @@ class CookTorrance(BRDF):
 
     def __call__(self, theta_s: ArrayLike, theta_o: ArrayLike) -> Array:
         """Value in 1/sr, broadcast over two arrays of angles in radians; 0 from below the horizon."""
-        s, o = (np.asarray(theta, dtype=np.float64) for theta in (theta_s, theta_o))
+        s, o = (np.clip(np.asarray(theta, dtype=np.float64), -math.pi, math.pi) for theta in (theta_s, theta_o))
         # The horizon itself counts as above: angles of pi/2 are rounded.
-        above = (np.abs(s) <= math.pi / 2) & (np.abs(o) <= math.pi / 2)
+        below = (np.abs(s) > math.pi / 2) | (np.abs(o) > math.pi / 2)
         cos_d = np.cos((s - o) / 2)
-        reflected = self.fresnel(np.where(above, np.maximum(cos_d, 0.0), 1.0))
+        reflected = self.fresnel(np.where(below, 1.0, np.maximum(cos_d, 0.0)))
         shape = self.density((s + o) / 2) * (cos_d / math.pi if self.facets == "grooves" else 0.25)
         value = np.maximum(reflected * shape, 0.0) * self.masking(s) * self.masking(o)
-        return np.where(above, value, 0.0)
+        return np.where(below, 0.0, value)
 
     def density(self, h: ArrayLike) -> Array:
         """D(h) per sr ("isotropic") or D1(h) per radian ("grooves") of facets tilted by h in the plane, in radians."""
@@ -154,3 +160,9 @@ class CookTorrance(BRDF):
     def angular_scale(self) -> float:
         """About the standard deviation of the lobe in u, alpha in radians."""
         return min(math.pi / 4, self.alpha)
+
+
+def _contrast(one: Any, two: Any, squares: Any) -> Any:
+    """(one - two) / (one + two), by the difference of their squares where that of themselves cancels."""
+    total, difference = one + two, one - two
+    return np.where(np.abs(difference) < 0.5 * np.abs(total), squares / total, difference) / total

@@ -8,11 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wallmirror.arithmetic import power_of_two
 from wallmirror.brdf.base import BRDF, AngleSumBRDF, Array, require_range
 from wallmirror.errors import InputError
 
 #: Most nodes that `tabulate_to` gives a table: along the angle sum, and along each of two angles.
 MOST_SUM_NODES, MOST_ANGLE_NODES = 1_152_001, 2881
+_FARTHEST, _CLOSEST = 1e6, 1e-100  # nodes, in radians
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,13 +35,20 @@ class AngleSumTable(AngleSumBRDF):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", _checked_table(self.values, 1))
-        if not -math.inf < self.start < self.stop < math.inf:
-            raise InputError("the first node must lie before the last", field="wall.table")
+        if not -_FARTHEST <= self.start < self.stop <= _FARTHEST:
+            raise InputError(
+                f"the first node must lie before the last, both within {_FARTHEST:g} rad", field="wall.table"
+            )
+        if self.angular_scale < max(_CLOSEST, 4 * math.ulp(max(abs(self.start), abs(self.stop)))):
+            raise InputError(f"has nodes {self.angular_scale:.2g} rad apart, which coincide", field="wall.table")
 
     def of_sum(self, u: ArrayLike) -> Array:
         """Value in 1/sr at angle sums u in radians, same shape."""
         nodes = np.linspace(self.start, self.stop, self.values.size)
-        return np.interp(np.asarray(u, dtype=np.float64), nodes, self.values, left=0.0, right=0.0)
+        # In units of the largest value: a slope at 1e300 or of denormals would leave the range of float64.
+        unit = power_of_two(self.values)
+        found = np.interp(np.asarray(u, dtype=np.float64), nodes, self.values / unit, left=0.0, right=0.0)
+        return np.asarray(found * unit, dtype=np.float64)
 
     @property
     def angular_scale(self) -> float:
@@ -94,9 +103,26 @@ class Tabulated:
 
 
 def tabulate(brdf: AngleSumBRDF, nodes: int = 7201) -> AngleSumTable:
-    """Sample a model onto `nodes` uniform angle sums over [-pi, pi], rounded to float32 as a path tracer holds it."""
-    u = np.linspace(-math.pi, math.pi, nodes)
-    return AngleSumTable(start=-math.pi, stop=math.pi, values=brdf.of_sum(u).astype(np.float32))
+    """Sample a model onto `nodes` uniform angle sums over [-pi, pi], rounded to float32 as a path tracer holds it.
+
+    Raises
+    ------
+    InputError
+        For a model that is no function of the angle sum, fewer than 2 or more than 1,152,001 nodes, or values whose largest
+        lies outside the range of float32.
+    """
+    if not isinstance(brdf, AngleSumBRDF):
+        raise InputError(
+            f"is a {type(brdf).__name__}, no function of the angle sum; use tabulate_to", field="wall.brdf"
+        )
+    require_range("nodes", nodes, 2, MOST_SUM_NODES)
+    values = brdf.of_sum(np.linspace(-math.pi, math.pi, nodes))
+    largest, single = float(values.max()), np.finfo(np.float32)
+    if largest != 0 and not float(single.tiny) <= largest <= float(single.max):
+        raise InputError(
+            f"peaks at {largest:.3g} / sr, outside the range of float32; use other units", field="wall.brdf"
+        )
+    return AngleSumTable(start=-math.pi, stop=math.pi, values=values.astype(np.float32))
 
 
 def tabulate_to(brdf: BRDF, tolerance: float = 1e-4) -> Tabulated:
@@ -177,7 +203,7 @@ def _relative(error: float, values: Array) -> float:
 def _cell(theta: ArrayLike, size: int) -> tuple[NDArray[np.intp], Array]:
     """Index and fraction of angles in a uniform grid of `size` nodes over [-pi/2, pi/2]."""
     place = (np.asarray(theta, dtype=np.float64) / math.pi + 0.5) * (size - 1)
-    index = np.clip(np.floor(place), 0, size - 2).astype(np.intp)
+    index = np.fmax(np.fmin(np.floor(place), size - 2), 0).astype(np.intp)  # of a NaN any, which its fraction keeps
     return index, np.clip(place - index, 0.0, 1.0)
 
 

@@ -21,6 +21,7 @@ from wallmirror.files import write_atomically
 
 _OWN_FILES = re.compile(rf"view\d+_real\d+(_variance)?\.exr|{re.escape(CAPTURES_FILE)}|{re.escape(TRUTH_FILE)}")
 _NOTE = b"# Written by wallmirror, which may replace this folder; remove this line to keep it."
+_LEAST_NORMAL = float(np.finfo(np.float32).tiny)
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -48,7 +49,8 @@ def write_captures(
     Raises
     ------
     InputError
-        If the folder holds anything else, a value is beyond float32, or the disk refuses.
+        If the folder holds anything else, a value is beyond float32, radiance or variance so small that float32 rounds it
+        away, or the disk refuses.
 
     Examples
     --------
@@ -59,6 +61,7 @@ def write_captures(
     shape = (captures.card.elements, captures.realisations)
     if truth is not None and truth.source.shape != shape:
         raise InputError(f"has shape {truth.source.shape}; give {shape}", field="truth.source")
+    _require_kept(captures)
     scratch = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
     try:
         require_replaceable(target)
@@ -75,6 +78,25 @@ def write_captures(
         raise InputError(error.message, file=named, field=error.field) from error
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _require_kept(captures: CaptureSet) -> None:
+    """Refuse films that float32 would store as dark, and noise that it would store as none."""
+    brightest = float(np.max(np.abs(captures.radiance)))
+    if 0 < brightest < _LEAST_NORMAL:
+        raise InputError(
+            f"is {brightest:.2g} at most, which float32 files hold hardly or not at all; choose a smaller unit",
+            field="radiance",
+        )
+    if captures.variance is not None:
+        # Faint pixels beside brighter ones may lose theirs, and noise below the rounding of the radiance.
+        largest = float(np.max(captures.variance, initial=0.0, where=np.isfinite(captures.variance)))
+        if (2.0**-24 * brightest) ** 2 < largest < _LEAST_NORMAL:
+            raise InputError(
+                f"is {largest:.2g} at most, which float32 files hold hardly or not at all; choose a smaller unit of the "
+                "radiance",
+                field="variance",
+            )
 
 
 def require_replaceable(target: Path) -> None:

@@ -11,6 +11,9 @@ from wallmirror.cli.options import app
 from wallmirror.console import Terminal
 from wallmirror.errors import WallmirrorError
 
+# With which Typer leaves where options or arguments are wrong, once it has said so.
+_MISUSED = 2
+
 __all__ = ["app", "filming", "main", "solving", "starting", "studying"]
 
 
@@ -27,6 +30,9 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(error.exit_code)
     except (KeyboardInterrupt, SystemExit) as end:  # Typer turns Ctrl-C into exit code 130 without a word
         if isinstance(end, SystemExit) and end.code != 130:
+            if end.code == _MISUSED and "--json" in given:
+                told = getattr(end.__context__, "format_message", lambda: "the command was not understood")()
+                Terminal(as_json=True).document({"error": told, "exit_code": _MISUSED})
             raise
         Terminal().error("interrupted; earlier results are untouched")
         sys.exit(130)

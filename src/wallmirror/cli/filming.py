@@ -119,9 +119,11 @@ def capture(
     scene: Annotated[str, typer.Argument(help="A scene's name, or a .toml file.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the capture set.")],
     spp: Annotated[
-        int | None, typer.Option(min=1, help="Samples per pixel; the plan's or the scene's own if left out.")
+        int | None, typer.Option(min=1, max=2**24, help="Samples per pixel; the plan's or the scene's own if left out.")
     ] = None,
-    max_depth: Annotated[int | None, typer.Option(min=2, help="2 is one bounce; the scene's own if left out.")] = None,
+    max_depth: Annotated[
+        int | None, typer.Option(min=2, max=1000, help="2 is one bounce; the scene's own if left out.")
+    ] = None,
     tolerance: Annotated[
         float | None,
         typer.Option(help="Error wanted, as for `advise`, which then chooses samples, seeds and depth."),

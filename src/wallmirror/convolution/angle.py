@@ -25,9 +25,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import make_interp_spline
 
+from wallmirror.arithmetic import rescaled
 from wallmirror.brdf import AngleSumBRDF
 from wallmirror.convolution.half_circle import HalfCircle
-from wallmirror.convolution.spherical import PointWeights, checked_source, cosines
+from wallmirror.convolution.spherical import PointWeights, cosines, source_in_unit
 from wallmirror.errors import InputError
 from wallmirror.geometry import Card, Observer, incident_angles, outgoing_angles, wall_points
 
@@ -91,7 +92,7 @@ def angle_convolution(
     >>> bool(np.linalg.norm(error) < 1e-4 * np.linalg.norm(exact))
     True
     """
-    source = checked_source(card, source)
+    source, unit = source_in_unit(card, source)
     grid = HalfCircle(samples=samples, order=order)
     x_r = _reference(observer, card, reference_x)
     mirrored = mirror_directions(observer, card, variable=variable, reference_x=x_r)
@@ -104,7 +105,7 @@ def angle_convolution(
     angles = convolution_variable(observer, card, variable=variable)
     render = np.stack([grid.read(row, angles) for row in coefficients], axis=-1)
     render *= cosine_factor(observer, card, weights=weights)[..., None]
-    return render.reshape(*angles.shape, *source.shape[1:])
+    return rescaled(render.reshape(*angles.shape, *source.shape[1:]), unit, field="source")
 
 
 def convolution_variable(observer: Observer, card: Card, *, variable: Variable = "sum") -> Array:
@@ -142,7 +143,7 @@ def resample(render: ArrayLike, at: ArrayLike, onto: ArrayLike, *, order: int = 
     onto:
         Angles wanted, (K,), within those of the pixels.
     order:
-        Degree of the spline, 1, 3, 5 ..; lower where there are too few pixels for it.
+        Degree of the spline, 0 (the pixel below), 1, 3, 5, 7 or 9; lower where there are too few pixels for it.
 
     Returns
     -------
@@ -162,8 +163,8 @@ def resample(render: ArrayLike, at: ArrayLike, onto: ArrayLike, *, order: int = 
     for name, array in (("render", render), ("angles", at), ("angles wanted", onto)):
         if not np.all(np.isfinite(array)):
             raise InputError("holds a value that is not finite", field=name)
-    if order < 0 or (order > 1 and order % 2 == 0):
-        raise InputError(f"is {order}; give 0 or an odd degree", field="order")
+    if order not in (0, 1, 3, 5, 7, 9):
+        raise InputError(f"is {order}; give 0 or an odd degree up to 9", field="order")
     if at.size > 1 and at[0] > at[-1]:
         render, at = render[::-1], at[::-1]
     if np.any(np.diff(at) <= 0):

@@ -21,9 +21,10 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wallmirror.arithmetic import rescaled
 from wallmirror.brdf import AngleSumBRDF
 from wallmirror.convolution.half_circle import require_angle_sum
-from wallmirror.convolution.spherical import checked_source, scene_angles
+from wallmirror.convolution.spherical import checked_source, scene_angles, source_in_unit
 from wallmirror.convolution.wall import parallel_view
 from wallmirror.errors import InputError
 from wallmirror.geometry import Card, Observer
@@ -55,7 +56,7 @@ def box_mirror_render(observer: Observer, card: Card, source: ArrayLike, *, widt
 def nearest_spherical(observer: Observer, card: Card, brdf: AngleSumBRDF, source: ArrayLike) -> Array:
     """The thesis's spherical convolution, with as many directions as pixels and the nearest one taken, (A, N)."""
     require_angle_sum(brdf)
-    source = checked_source(card, source)
+    source, unit = source_in_unit(card, source)
     if observer.pixels < 2:
         raise InputError("needs at least two pixels, which are its directions as well", field="observer.pixels")
     theta_s, theta_o = scene_angles(observer, card)
@@ -67,7 +68,7 @@ def nearest_spherical(observer: Observer, card: Card, brdf: AngleSumBRDF, source
     # Index k of the source and l of the BRDF's map meet in the full convolution's sample k + l, whose 2N - 1 samples are
     # read as if they covered the half circle: half a step each. With rho's map about theta_o the sum comes out as this.
     shift = 2 * nearest(theta_o, step / 2) - theta_o
-    return np.asarray(brdf.of_sum(nearest(theta_s, step) + shift[..., None]) @ source, dtype=np.float64)
+    return rescaled(brdf.of_sum(nearest(theta_s, step) + shift[..., None]) @ source, unit, field="source")
 
 
 def scattered_projection(observer: Observer, brdf: AngleSumBRDF) -> tuple[Array, NDArray[np.bool_]]:

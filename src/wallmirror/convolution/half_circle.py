@@ -23,6 +23,7 @@ from wallmirror.errors import InputError
 Array = NDArray[np.float64]
 
 _MAX_ORDER = 9
+_MOST_SAMPLES = 10**7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +54,10 @@ class HalfCircle:
     order: int = 3
 
     def __post_init__(self) -> None:
-        if self.samples < 2:
-            raise InputError(f"needs at least two directions, not {self.samples}", field="samples")
+        if not isinstance(self.samples, (int, np.integer)) or not 2 <= self.samples <= _MOST_SAMPLES:
+            raise InputError(
+                f"needs at least two directions and at most {_MOST_SAMPLES}, not {self.samples}", field="samples"
+            )
         if self.order not in range(_MAX_ORDER + 1):
             raise InputError(f"is {self.order}; give a whole number from 0 to {_MAX_ORDER}", field="order")
 
@@ -113,7 +116,12 @@ class HalfCircle:
     def read(self, outgoing: ArrayLike, angles: ArrayLike) -> Array:
         """Values at angles of shape S from coefficients (2K,), or from one row each of coefficients (*S, 2K)."""
         nodes, values = self.weights(angles)
-        outgoing = np.asarray(outgoing, dtype=np.float64)
+        outgoing = _finite("outgoing", outgoing)
+        if outgoing.shape not in ((2 * self.samples,), (*nodes.shape[1:], 2 * self.samples)):
+            raise InputError(
+                f"has shape {outgoing.shape}; give {2 * self.samples} coefficients, or as many for each angle",
+                field="outgoing",
+            )
         if outgoing.ndim == 1:
             taken = outgoing[nodes]
         else:

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wallmirror.arithmetic import power_of_two, rescaled
 from wallmirror.brdf import BRDF, AngleSumBRDF, AngleSumTable, Mirror
+from wallmirror.brdf.tables import MOST_ANGLE_NODES
 from wallmirror.convolution.angle import Variable, angle_convolution
 from wallmirror.convolution.spherical import PointWeights, checked_source, cosines, spherical_convolution
 from wallmirror.convolution.wall import wall_convolution
@@ -26,14 +28,23 @@ def relative_error(render: ArrayLike, reference: ArrayLike) -> float:
 
     Raises
     ------
+    InputError
+        For renders of other shapes, or that are not finite, at least in units of the reference.
     UndeterminedError
         If the reference is zero.
     """
-    reference = np.asarray(reference, dtype=np.float64)
-    size = float(np.linalg.norm(reference))
-    if size == 0:
+    found, reference = np.asarray(render, dtype=np.float64), np.asarray(reference, dtype=np.float64)
+    if found.shape != reference.shape:
+        raise InputError(f"has shape {found.shape} where the reference has {reference.shape}", field="render")
+    if not np.any(reference):
         raise UndeterminedError("the reference render is dark, so no error can be relative to it")
-    return float(np.linalg.norm(np.asarray(render, dtype=np.float64) - reference)) / size
+    unit = power_of_two(reference)
+    with np.errstate(over="ignore", invalid="ignore"):
+        reference = reference / unit
+        apart = float(np.linalg.norm(found / unit - reference))
+    if not math.isfinite(apart):
+        raise InputError("or the reference holds a value that is not finite, or one too large for it", field="render")
+    return apart / float(np.linalg.norm(reference))
 
 
 def convolution_errors(
@@ -154,13 +165,15 @@ def best_angle_sum(
         raise InputError("is a mirror, a delta without values; it is a function of the angle sum", field="wall.brdf")
     if not 0 < limit < math.pi / 2:
         raise InputError(f"is {math.degrees(limit):g} deg; give an angle between 0 and 90 deg", field="limit")
-    if samples < 2:
-        raise InputError(f"needs at least two angles, not {samples}", field="samples")
+    if not isinstance(samples, (int, np.integer)) or not 2 <= samples <= MOST_ANGLE_NODES:
+        raise InputError(f"needs two angles at least and {MOST_ANGLE_NODES} at most, not {samples}", field="samples")
     theta = np.linspace(-limit, limit, samples)
     target = np.asarray(brdf(theta[:, None], theta), dtype=np.float64) * cosines(theta[:, None], weights)
-    size = float(np.linalg.norm(target))
-    if size == 0:
+    if not np.any(target):
         raise UndeterminedError("the BRDF is zero throughout, so no approximation can be near it in relative terms")
+    unit = power_of_two(target)
+    target /= unit
+    size = float(np.linalg.norm(target))
     line = np.add.outer(np.arange(samples), np.arange(samples))
     factor = np.ones(samples)
     before = math.inf
@@ -176,5 +189,5 @@ def best_angle_sum(
         power_o = np.sum(values**2, axis=0)
         factor = np.sum(values * target, axis=0) / np.where(power_o > 0, power_o, 1.0)
         factor /= factor.mean()
-    table = AngleSumTable(start=-2 * limit, stop=2 * limit, values=r)
+    table = AngleSumTable(start=-2 * limit, stop=2 * limit, values=rescaled(r, unit, field="wall.brdf"))
     return AngleSumFit(brdf=table, theta_o=theta, factor=factor, residual=residual)

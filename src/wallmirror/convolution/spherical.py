@@ -13,6 +13,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wallmirror.arithmetic import power_of_two, rescaled
 from wallmirror.brdf import AngleSumBRDF
 from wallmirror.convolution.half_circle import HalfCircle
 from wallmirror.errors import InputError
@@ -74,7 +75,7 @@ def spherical_convolution(
     >>> bool(np.linalg.norm(ours - exact) < 1e-5 * np.linalg.norm(exact))
     True
     """
-    source = checked_source(card, source)
+    source, unit = source_in_unit(card, source)
     theta_s, theta_o = scene_angles(observer, card)
     grid = HalfCircle(samples=samples, order=order)
     rho = grid.coefficients(brdf)
@@ -84,7 +85,7 @@ def spherical_convolution(
     for s, o in itertools.product(range(order + 1), repeat=2):
         product = rho[(nodes_s[s] + nodes_o[o][..., None]) % rho.size]
         transport += values_s[s] * values_o[o][..., None] * product
-    return np.asarray(transport * cosines(theta_s, weights) @ source, dtype=np.float64)
+    return rescaled(transport * cosines(theta_s, weights) @ source, unit, field="source")
 
 
 def outgoing_light(
@@ -106,7 +107,7 @@ def outgoing_light(
     samples, order, weights:
         As in `spherical_convolution`. Direction k is -pi/2 + (k + 1/2) pi / K.
     """
-    source = checked_source(card, source)
+    source, unit = source_in_unit(card, source)
     if source.ndim != 1:
         raise InputError(f"has shape {source.shape}; give the radiance of one realisation, (M,)", field="source")
     theta_s, theta_o = scene_angles(observer, card)
@@ -121,7 +122,7 @@ def outgoing_light(
         coefficients = grid.outgoing(grid.spread(flat_s[part], flat_v[part]), brdf)
         nodes, values = grid.weights(directions)
         light[part] = np.einsum("pk,rpk->rk", values, coefficients[:, nodes])
-    return light.reshape(*theta_o.shape, samples)
+    return rescaled(light.reshape(*theta_o.shape, samples), unit, field="source")
 
 
 def half_circle_directions(samples: int) -> Array:
@@ -153,3 +154,10 @@ def checked_source(card: Card, source: ArrayLike) -> Array:
     if not np.all(np.isfinite(array)):
         raise InputError("holds a value that is not finite", field="source")
     return array
+
+
+def source_in_unit(card: Card, source: ArrayLike) -> tuple[Array, float]:
+    """The source, checked, in units of a power of two near its largest value, and that unit: renders are linear in it."""
+    array = checked_source(card, source)
+    unit = power_of_two(array)
+    return array / unit, unit

@@ -15,10 +15,11 @@ import numpy as np
 import scipy.signal
 from numpy.typing import ArrayLike, NDArray
 
+from wallmirror.arithmetic import power_of_two, rescaled
 from wallmirror.brdf import AngleSumBRDF, Mirror
 from wallmirror.convolution.angle import cosine_factor, mirror_points
 from wallmirror.convolution.half_circle import require_angle_sum
-from wallmirror.convolution.spherical import PointWeights, checked_source
+from wallmirror.convolution.spherical import PointWeights, checked_source, source_in_unit
 from wallmirror.errors import InputError
 from wallmirror.geometry import Card, Observer, wall_points
 from wallmirror.transport import mirror_matrix, radiance
@@ -66,11 +67,11 @@ def wall_convolution(
     >>> round(float(x[wall_convolution(observer, card, lobe, [1.0]).argmax()]), 2)  # Algorithm 1 has it at 3.14
     3.34
     """
-    source = checked_source(card, source)
+    source, unit = source_in_unit(card, source)
     offsets = wall_points(observer)[..., None] - mirror_points(observer, card, card.elements_x)
     copies = projected_brdf(observer, card, brdf, offsets, projected_from=projected_from)
     factor = cosine_factor(observer, card, weights=weights)
-    return np.asarray((factor[..., None] * copies) @ source, dtype=np.float64)
+    return rescaled((factor[..., None] * copies) @ source, unit, field="source")
 
 
 def projected_brdf(
@@ -90,7 +91,11 @@ def projected_brdf(
     y = observer.distance
     if projected_from == "both":
         y = 1 / (1 / y + 1 / card.distance)
-    return brdf.of_sum(-np.arctan(np.asarray(offsets, dtype=np.float64) / y))
+    offsets = np.asarray(offsets, dtype=np.float64)
+    if not np.all(np.isfinite(offsets)):
+        raise InputError("hold a value that is not finite", field="offsets")
+    with np.errstate(over="ignore"):  # beyond float64 the angle is 90 deg
+        return brdf.of_sum(-np.arctan(offsets / y))
 
 
 def mirror_render(observer: Observer, card: Card, source: ArrayLike) -> Array:
@@ -127,7 +132,7 @@ def convolve_centred(signal: ArrayLike, kernel: ArrayLike) -> Array:
     Raises
     ------
     InputError
-        For an even or empty kernel, an empty signal, or values that are not finite.
+        For an even or empty kernel, an empty signal, values that are not finite, or a product outside float64's range.
 
     Examples
     --------
@@ -145,12 +150,14 @@ def convolve_centred(signal: ArrayLike, kernel: ArrayLike) -> Array:
     for name, array in (("signal", signal), ("kernel", kernel)):
         if not np.all(np.isfinite(array)):
             raise InputError("holds a value that is not finite", field=name)
+    units = power_of_two(signal), power_of_two(kernel)
+    signal, kernel = signal / units[0], kernel / units[1]
     columns = signal.reshape(signal.shape[0], -1)
     shaped = kernel[:, None]
     method = scipy.signal.choose_conv_method(columns[:, :1], shaped, mode="full")
     half, n = kernel.size // 2, signal.shape[0]
     full = [scipy.signal.convolve(column, kernel, mode="full", method=method) for column in columns.T]
-    return np.stack(full, axis=-1)[half : half + n].reshape(signal.shape)
+    return rescaled(np.stack(full, axis=-1)[half : half + n].reshape(signal.shape), *units, field="signal")
 
 
 def parallel_view(observer: Observer) -> Array:

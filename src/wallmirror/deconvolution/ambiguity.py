@@ -12,7 +12,8 @@ import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike
 
-from wallmirror.deconvolution.checking import Array, real_samples
+from wallmirror.arithmetic import rescaled
+from wallmirror.deconvolution.checking import Array, in_unit, real_samples
 from wallmirror.errors import InputError
 
 
@@ -41,7 +42,7 @@ def align(estimate: ArrayLike, truth: ArrayLike) -> Aligned:
     Raises
     ------
     InputError
-        For a truth that is zero everywhere, or arrays of different numbers of axes.
+        For a truth that is zero everywhere, arrays of different numbers of axes, or a scale outside the range of float64.
 
     Examples
     --------
@@ -51,6 +52,7 @@ def align(estimate: ArrayLike, truth: ArrayLike) -> Aligned:
     """
     t = real_samples(truth, "truth")
     e = real_samples(estimate, "estimate", ndim=t.ndim)
+    (t, true_unit), (e, unit) = in_unit(t), in_unit(e)
     size, energy = float(np.sum(t * t)), float(np.sum(e * e))
     if size == 0:
         raise InputError("is zero everywhere, so there is nothing to compare with", field="truth")
@@ -69,4 +71,4 @@ def align(estimate: ArrayLike, truth: ArrayLike) -> Aligned:
     beyond = e.copy()
     beyond[taken] = 0.0
     error = math.sqrt((float(np.sum((t - scale * moved) ** 2)) + scale**2 * float(np.sum(beyond**2))) / size)
-    return Aligned(error, shift, scale)
+    return Aligned(error, shift, float(rescaled(scale, true_unit, 1 / unit, field="estimate")))

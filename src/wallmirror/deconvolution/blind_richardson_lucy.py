@@ -15,8 +15,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from wallmirror.arithmetic import rescaled
 from wallmirror.deconvolution.blind import BlindEstimate
-from wallmirror.deconvolution.checking import Array, count, nonnegative_samples
+from wallmirror.deconvolution.checking import Array, count, in_unit, nonnegative_samples
 from wallmirror.deconvolution.operators import Convolution, Mode
 from wallmirror.deconvolution.richardson_lucy import RichardsonLucyStep
 from wallmirror.errors import InputError, UndeterminedError
@@ -73,10 +74,13 @@ def blind_richardson_lucy(
     h = nonnegative_samples(kernel_start, "kernel_start", ndim=g.ndim)
     count(iterations, "iterations")
     count(inner, "inner")
-    size = float(np.linalg.norm(g))
-    if size == 0:
+    if not np.any(g):
         raise UndeterminedError("the data are zero everywhere, which any signal with a kernel of zero explains")
-    h = _unit_sum(h, "kernel_start")
+    g, unit = in_unit(g)
+    background = background / unit
+    size = float(np.linalg.norm(g))
+    h = _unit_sum(in_unit(h)[0], "kernel_start")
+    f = in_unit(f)[0]
     f = f * (g.sum() / _unit_total(f, "signal_start"))
     blur = Convolution(h, f.shape, mode=mode)
     if blur.data_shape != g.shape:
@@ -93,7 +97,9 @@ def blind_richardson_lucy(
         blur = Convolution(h, f.shape, mode=mode)
         f = _steps(blur, g, f, inner, background, check=False)
         residual.append(float(np.linalg.norm(g - blur.apply(f) - background)) / size)
-    return BlindEstimate(signal=f, kernel=h, iterations=iterations, residual=np.array(residual))
+    return BlindEstimate(
+        signal=rescaled(f, unit, field="data"), kernel=h, iterations=iterations, residual=np.array(residual)
+    )
 
 
 def _steps(operator: Convolution, data: Array, start: Array, count: int, background: float, *, check: bool) -> Array:

@@ -8,12 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wallmirror.arithmetic import power_of_two
 from wallmirror.errors import InputError
 
 Array = NDArray[np.float64]
 
 #: Of an operator applied by FFT, relative to its largest value: some eps times log2 of the length.
 ROUNDING = 64 * float(np.finfo(np.float64).eps)
+_SMALLEST = 1e-120  # of a kernel's largest values, of which alpha is the square
 
 
 def real_samples(values: ArrayLike, field: str, *, ndim: int | None = None) -> Array:
@@ -24,7 +26,10 @@ def real_samples(values: ArrayLike, field: str, *, ndim: int | None = None) -> A
     InputError
         Unless they are real, finite, at least one, and of `ndim` axes.
     """
-    given = np.asarray(values)
+    try:
+        given = np.asarray(values)
+    except ValueError:
+        raise InputError("holds rows of unequal lengths; give rows of one length", field=field) from None
     if given.dtype.kind not in "biuf":
         raise InputError(f"holds {given.dtype} values; give real numbers", field=field)
     samples = np.asarray(given, dtype=np.float64)
@@ -59,9 +64,25 @@ def positive(value: float, field: str) -> float:
 
 def count(value: int, field: str) -> int:
     """The value, where it is a whole number >= 1."""
-    if isinstance(value, bool) or int(value) != value or value < 1:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise InputError(f"is {value}; give a whole number >= 1", field=field)
     return int(value)
+
+
+def in_unit(values: Array) -> tuple[Array, float]:
+    """The values in units of a power of two near their largest, and that unit; no square of them leaves float64's range."""
+    unit = power_of_two(values)
+    return values / unit, unit
+
+
+def require_squares(values: Array, field: str) -> None:
+    """Raise InputError where the largest value has a square, or squares beside it, that float64 cannot hold."""
+    largest = float(np.max(np.abs(values), initial=0.0))
+    if largest > 0 and not _SMALLEST <= largest <= 1 / _SMALLEST:
+        raise InputError(
+            f"peaks at {largest:.3g}, whose square, in which alpha is measured, leaves the range of float64; use other units",
+            field=field,
+        )
 
 
 def one_of(value: str, choices: Sequence[str], field: str) -> None:

@@ -20,7 +20,9 @@ import scipy.linalg as sl
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
-from wallmirror.deconvolution.channels import checked_outputs, finite_array
+from wallmirror.arithmetic import rescaled
+from wallmirror.deconvolution.channels import checked_outputs
+from wallmirror.deconvolution.checking import real_samples
 from wallmirror.errors import InputError, UndeterminedError
 
 Array = NDArray[np.float64]
@@ -44,7 +46,7 @@ class IdentifiedChannels:
     channels:
         h (K, n), |h| = 1, with positive sum.
     sources:
-        The source within each record, (R, L + n - 1): least squares, weakly known at the ends.
+        The source within each record, (R, L + n - 1): least squares, weakly known at the ends; in the outputs' units.
     misfit:
         Root of the smallest eigenvalue over that of the largest: how far the equations are from having a solution.
     gap:
@@ -101,7 +103,7 @@ def identify_channels(
         raise InputError(f'is "{method}"; choose one of {", ".join(get_args(ChannelMethod))}', field="method")
     if method == "cross_relation" and window is not None:
         raise InputError("has a meaning for the subspace method alone; leave it out", field="window")
-    g = _records(outputs, taps)
+    g, scale = _records(outputs, taps)
     records, channels, length = g.shape
     rows = records * (length - taps + 1) * channels * (channels - 1) // 2
     unknowns = channels * taps
@@ -125,7 +127,7 @@ def identify_channels(
     noise = smallest / max(1.0, rows * 2 / channels - unknowns)
     return IdentifiedChannels(
         channels=h,
-        sources=np.array([windowed_source(record, h) for record in g]),
+        sources=rescaled(np.array([windowed_source(record, h) for record in g]), scale, field="outputs"),
         misfit=float(np.sqrt(smallest / values[-1])),
         gap=float(np.sqrt(values[1] / values[-1])),
         predicted_error=float(np.sqrt(noise * np.sum(1 / values[1:]))),
@@ -146,7 +148,7 @@ def rival_channels(outputs: ArrayLike, taps: int) -> int:
     (1, 3)
     """
     with threadpool_limits(limits=1, user_api="blas"):  # two threads that wait for each other are far slower
-        values = np.linalg.eigvalsh(_cross_relation_gram(_records(outputs, taps), taps))
+        values = np.linalg.eigvalsh(_cross_relation_gram(_records(outputs, taps)[0], taps))
     best = max(float(values[0]), _ZERO * float(values[-1]))
     return max(1, int(np.count_nonzero(values <= best / _SEPARATED)))
 
@@ -165,20 +167,22 @@ def windowed_source(outputs: Array, channels: Array) -> Array:
     return np.asarray(sl.solveh_banded(band, right, lower=True), dtype=np.float64)
 
 
-def _records(outputs: ArrayLike, taps: int) -> Array:
+def _records(outputs: ArrayLike, taps: int) -> tuple[Array, float]:
+    """Outputs (R, K, L) divided by a power of two near their largest magnitude, and that power."""
     try:
         records_given = np.ndim(outputs) == 3
     except ValueError:  # rows of unequal lengths, refused below
         records_given = False
     if not records_given:
-        return checked_outputs(outputs, taps)[0][None]
-    g = finite_array(outputs, "outputs", 3)
+        one, scale = checked_outputs(outputs, taps)
+        return one[None], scale
+    g = real_samples(outputs, "outputs", ndim=3)
     # All records laid end to end stand or fall together.
     joined = np.moveaxis(g, 1, 0).reshape(g.shape[1], -1)
     scale = checked_outputs(joined, taps)[1]
     if taps > g.shape[2]:
         raise InputError(f"is {taps}, longer than the record of {g.shape[2]} samples; give fewer taps", field="taps")
-    return g / scale
+    return g / scale, scale
 
 
 def _windows(g: Array, width: int) -> Array:
@@ -224,7 +228,7 @@ def _subspace_gram(g: Array, taps: int, window: int | None) -> tuple[Array, int]
     _, channels, length = g.shape
     width = window if window is not None else max(taps, -(-taps // (channels - 1)) + 1)
     signal = width + taps - 1
-    if not channels * width > signal or width > length:
+    if not isinstance(width, int) or not channels * width > signal or width > length:
         raise InputError(
             f"is {width}; give from {taps // (channels - 1) + 1} samples to the record's {length}", field="window"
         )

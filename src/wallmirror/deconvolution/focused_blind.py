@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wallmirror.arithmetic import rescaled
 from wallmirror.deconvolution.channels import checked_outputs
 from wallmirror.deconvolution.cross_relation import rival_channels
 from wallmirror.deconvolution.interferometric_fit import InterferometricFit, fit_interferometric
@@ -34,7 +35,7 @@ class FocusedBlind:
     source, channels:
         f (S,) and h (K, n), |h| = 1.
     interferometric, retrieval:
-        What the two stages found.
+        What the two stages found, in units of a power of two near the outputs' largest value.
     misfit:
         |g - f * h| / |g| of the end.
     predicted_error:
@@ -123,7 +124,7 @@ def focused_blind(
     # No descent: how far the outputs are missed here, and what that misfit can hide.
     fit = least_squares_blind(g, taps, start=second.channels, steps=100 if refine else 0)
     return FocusedBlind(
-        source=fit.source * scale,
+        source=rescaled(fit.source, scale, field="outputs"),
         channels=fit.channels,
         interferometric=first,
         retrieval=second,

@@ -21,7 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 from threadpoolctl import threadpool_limits
 
+from wallmirror.arithmetic import rescaled
 from wallmirror.deconvolution.channels import checked_outputs
+from wallmirror.deconvolution.checking import count
 from wallmirror.deconvolution.interferometry import pairs
 from wallmirror.errors import InputError
 
@@ -80,7 +82,7 @@ def fit_interferometric(
     Raises
     ------
     InputError, UndeterminedError
-        As `checked_outputs`; InputError for weights that rise.
+        As `checked_outputs`; InputError for weights that rise, and for correlations outside the range of float64.
 
     Examples
     --------
@@ -93,7 +95,10 @@ def fit_interferometric(
     True
     """
     g, scale = checked_outputs(outputs, taps)
-    if not weights or min(weights) < 0 or any(b > a for a, b in itertools.pairwise(weights)):
+    count(steps, "steps")
+    if not target >= 0:
+        raise InputError(f"is {target:g}; give a number >= 0", field="target")
+    if len(weights) == 0 or not all(w >= 0 for w in weights) or any(b > a for a, b in itertools.pairwise(weights)):
         raise InputError(f"is {tuple(weights)}; give weights >= 0 that fall", field="weights")
     history: list[float] = []
     with threadpool_limits(limits=1, user_api="blas"):  # two threads that wait for each other are far slower
@@ -106,7 +111,8 @@ def fit_interferometric(
         misfit = problem.misfit(f_a, correlations)
     auto = correlations[problem.is_auto]
     whiteness = float(np.sum(auto[:, taps - 1] ** 2) / max(np.sum(auto * auto), 1e-300))
-    return InterferometricFit(f_a, correlations * scale**2, misfit, whiteness, tuple(history))
+    correlations = rescaled(correlations, scale, scale, field="outputs")
+    return InterferometricFit(f_a, correlations, misfit, whiteness, tuple(history))
 
 
 def _mixed_alternation(

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
-from wallmirror.deconvolution.channels import finite_array
+from wallmirror.arithmetic import rescaled
+from wallmirror.deconvolution.checking import in_unit, real_samples
 from wallmirror.errors import InputError
 
 Array = NDArray[np.float64]
@@ -34,13 +35,13 @@ def cross_correlations(signals: ArrayLike) -> Array:
            [1., 2., 0.],
            [0., 1., 0.]])
     """
-    h = finite_array(signals, "signals", 2)
+    h, unit = in_unit(real_samples(signals, "signals", ndim=2))
     taps = h.shape[1]
     size = next_fast_len(2 * taps - 1, real=True)
     spectra = rfft(h, size)
     i, j = pairs(h.shape[0])
-    correlations: Array = irfft(spectra[i] * np.conj(spectra[j]), size)[:, np.arange(-(taps - 1), taps)]
-    return correlations
+    correlations = irfft(spectra[i] * np.conj(spectra[j]), size)[:, np.arange(-(taps - 1), taps)]
+    return rescaled(correlations, unit, unit, field="signals")
 
 
 def identity_error(outputs: ArrayLike, source: ArrayLike, channels: ArrayLike, *, free_scale: bool = False) -> float:
@@ -62,8 +63,11 @@ def identity_error(outputs: ArrayLike, source: ArrayLike, channels: ArrayLike, *
     >>> identity_error(convolve_channels(f, h), f, h) < 1e-14
     True
     """
-    g = finite_array(outputs, "outputs", 2)
-    f, h = finite_array(source, "source", 1), finite_array(channels, "channels", 2)
+    g, unit = in_unit(real_samples(outputs, "outputs", ndim=2))
+    f, source_unit = in_unit(real_samples(source, "source", ndim=1))
+    h, channel_unit = in_unit(real_samples(channels, "channels", ndim=2))
+    if not np.any(g):
+        raise InputError("is zero everywhere, so no error can be relative to it", field="outputs")
     if f.size + h.shape[1] - 1 != g.shape[1] or h.shape[0] != g.shape[0]:
         raise InputError(
             f"has shape {g.shape}; {h.shape[0]} channels of {h.shape[1]} taps and a source of {f.size} samples make "
@@ -77,4 +81,6 @@ def identity_error(outputs: ArrayLike, source: ArrayLike, channels: ArrayLike, *
     predicted = irfft(np.abs(rfft(f, size)) ** 2 * channel_spectra[i] * np.conj(channel_spectra[j]), size)
     if free_scale:
         predicted *= np.sum(recorded * predicted) / max(float(np.sum(predicted * predicted)), 1e-300)
+    else:
+        predicted = rescaled(predicted, *2 * (source_unit, channel_unit, 1 / unit), field="source")
     return float(np.linalg.norm(recorded - predicted) / np.linalg.norm(recorded))

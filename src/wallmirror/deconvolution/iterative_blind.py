@@ -22,8 +22,9 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wallmirror.arithmetic import rescaled
 from wallmirror.deconvolution.blind import BlindEstimate
-from wallmirror.deconvolution.checking import Array, count, one_of, positive, real_samples
+from wallmirror.deconvolution.checking import Array, count, in_unit, one_of, positive, real_samples, require_squares
 from wallmirror.deconvolution.operators import inverse, transform
 from wallmirror.errors import InputError, UndeterminedError
 
@@ -83,11 +84,13 @@ def iterative_blind(
     positive(alpha, "alpha")
     count(iterations, "iterations")
     one_of(nonnegativity, get_args(Nonnegativity), "nonnegativity")
-    size = float(np.linalg.norm(g))
-    if size == 0:
+    if not np.any(g):
         raise UndeterminedError("the data are zero everywhere, which any signal with a kernel of zero explains")
-    f = g if signal_start is None else _start(signal_start, g.shape, "signal_start")
+    g, unit = in_unit(g)
+    size = float(np.linalg.norm(g))
+    f = g if signal_start is None else _start(signal_start, g.shape, "signal_start", unit)
     h = _middle(where_h) if kernel_start is None else _start(kernel_start, g.shape, "kernel_start")
+    alpha = alpha / unit / unit  # in these units: as good as nothing for bright data, and infinite for dark ones
 
     def constrained(spectrum: NDArray[np.complex128], where: NDArray[np.bool_]) -> Array:
         values = inverse(spectrum, g.shape)
@@ -106,9 +109,11 @@ def iterative_blind(
         residual.append(float(np.linalg.norm(g - inverse(signal_spectrum * kernel_spectrum, g.shape))) / size)
         if not (np.any(f) and np.any(h)):
             raise UndeterminedError(
-                f"the estimate vanished after {len(residual)} iterations; lower alpha ({alpha:g}) or widen the supports"
+                f"the estimate vanished after {len(residual)} iterations; lower alpha or widen the supports"
             )
-    return BlindEstimate(signal=f, kernel=h, iterations=iterations, residual=np.array(residual))
+    return BlindEstimate(
+        signal=rescaled(f, unit, field="data"), kernel=h, iterations=iterations, residual=np.array(residual)
+    )
 
 
 def corner_support(shape: tuple[int, ...], extent: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -119,7 +124,9 @@ def corner_support(shape: tuple[int, ...], extent: tuple[int, ...]) -> NDArray[n
     >>> corner_support((4,), (2,)).tolist()
     [True, True, False, False]
     """
-    if len(shape) != len(extent) or any(not 1 <= k <= n for n, k in zip(shape, extent, strict=False)):
+    if len(shape) != len(extent) or any(
+        not (isinstance(k, (int, np.integer)) and 1 <= k <= n) for n, k in zip(shape, extent, strict=False)
+    ):
         raise InputError(f"is {extent}; give 1 to as many samples as the data {shape} along each axis", field="extent")
     support = np.zeros(shape, dtype=np.bool_)
     support[tuple(slice(0, k) for k in extent)] = True
@@ -129,9 +136,10 @@ def corner_support(shape: tuple[int, ...], extent: tuple[int, ...]) -> NDArray[n
 def _wiener(
     data: NDArray[np.complex128], known: NDArray[np.complex128], sought: NDArray[np.complex128], alpha: float
 ) -> NDArray[np.complex128]:
-    """G K* / (|K|^2 + alpha / |S|^2), without a division by |S| = 0, where it is zero."""
+    """G K* / (|K|^2 + alpha / |S|^2), without a division by |S| = 0 or by nothing, where it is zero."""
     power = np.abs(sought) ** 2
-    return np.asarray(data * known.conj() * power / (np.abs(known) ** 2 * power + alpha))
+    weight = np.abs(known) ** 2 * power + alpha
+    return np.asarray(data * known.conj() * np.divide(power, weight, out=np.zeros_like(power), where=weight > 0))
 
 
 def _middle(support: NDArray[np.bool_]) -> Array:
@@ -149,8 +157,9 @@ def _support(values: ArrayLike, shape: tuple[int, ...], field: str) -> NDArray[n
     return support
 
 
-def _start(values: ArrayLike, shape: tuple[int, ...], field: str) -> Array:
-    start = real_samples(values, field)
+def _start(values: ArrayLike, shape: tuple[int, ...], field: str, unit: float = 1.0) -> Array:
+    start = real_samples(values, field) / unit
+    require_squares(start, field)
     if start.shape != shape or not start.any():
         raise InputError(f"needs the shape of the data {shape} and some value other than zero", field=field)
     return start

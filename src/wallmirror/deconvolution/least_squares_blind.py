@@ -18,7 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 from threadpoolctl import threadpool_limits
 
-from wallmirror.deconvolution.channels import checked_outputs, finite_array
+from wallmirror.arithmetic import rescaled
+from wallmirror.deconvolution.channels import checked_outputs
+from wallmirror.deconvolution.checking import in_unit, real_samples
 from wallmirror.deconvolution.levenberg import descend
 from wallmirror.errors import InputError
 
@@ -83,7 +85,9 @@ def least_squares_blind(outputs: ArrayLike, taps: int, *, start: ArrayLike, step
     True
     """
     g, scale = checked_outputs(outputs, taps)
-    h = finite_array(start, "start", 2)
+    h = in_unit(real_samples(start, "start", ndim=2))[0]
+    if not isinstance(steps, (int, np.integer)) or steps < 0:
+        raise InputError(f"is {steps}; give a whole number >= 0", field="steps")
     if h.shape != (g.shape[0], taps) or not np.any(h):
         raise InputError(
             f"has shape {h.shape}; give channels of shape {(g.shape[0], taps)}, not all zero", field="start"
@@ -98,7 +102,7 @@ def least_squares_blind(outputs: ArrayLike, taps: int, *, start: ArrayLike, step
         amplification = problem.amplification(channels)
     power = float(np.sum(g * g))
     return LeastSquaresBlind(
-        source=problem.source(channels) * scale,
+        source=rescaled(problem.source(channels), scale, field="outputs"),
         channels=channels,
         misfit=float(np.sqrt(2 * end.cost / power)),
         amplification=amplification,

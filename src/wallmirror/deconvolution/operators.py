@@ -14,7 +14,7 @@ from __future__ import annotations
 import copy
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, get_args
 
 import numpy as np
@@ -23,8 +23,9 @@ import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.linalg import LinearOperator
 
-from wallmirror.deconvolution.checking import one_of, real_samples
+from wallmirror.deconvolution.checking import in_unit, one_of, real_samples
 from wallmirror.errors import InputError
+from wallmirror.memory import require_memory
 
 Array = NDArray[np.float64]
 
@@ -32,6 +33,9 @@ Array = NDArray[np.float64]
 Mode = Literal["full", "same", "periodic"]
 
 _WORTH_THREADS = 1 << 18  # samples of a transform
+_WORTH_ASKING = 10**7  # samples from which on the memory might not do
+_MATRIX_BYTES = 16.0  # an entry, and its copy
+_GRID_BYTES = 48.0  # a sample: the transform, its conjugate, and those of signal and product
 
 
 class Convolution(LinearOperator):  # type: ignore[misc]
@@ -92,6 +96,8 @@ class Convolution(LinearOperator):  # type: ignore[misc]
         else:
             self._grid = tuple(int(scipy.fft.next_fast_len(n, real=axis == h.ndim - 1)) for axis, n in enumerate(full))
         self.data_shape = full if mode == "full" else self.signal_shape
+        if math.prod(self._grid) > _WORTH_ASKING:
+            require_memory(_GRID_BYTES * math.prod(self._grid), f"a convolution on a grid of {self._grid} samples")
         self._place(h, self.signal_shape)
 
     def _place(self, given: Array, taken_shape: tuple[int, ...]) -> None:
@@ -110,11 +116,11 @@ class Convolution(LinearOperator):  # type: ignore[misc]
 
     def apply(self, signal: ArrayLike) -> Array:
         """H f, shape `data_shape`."""
-        return self._forward(_shaped(signal, self.signal_shape, "signal"))
+        return _finite(self._forward, _shaped(signal, self.signal_shape, "signal"), "signal")
 
     def adjoint(self, data: ArrayLike) -> Array:
         """H^T g, shape `signal_shape`."""
-        return self._backward(_shaped(data, self.data_shape, "data"))
+        return _finite(self._backward, _shaped(data, self.data_shape, "data"), "data")
 
     def _forward(self, signal: Array) -> Array:
         spectrum = transform(signal, self._grid)
@@ -194,7 +200,10 @@ def toeplitz_matrix(
             raise InputError(
                 f'has {h.size} samples, longer than the period {n}; use mode "full" or "same"', field="kernel"
             )
+        require_memory(_MATRIX_BYTES * n * n, f"a matrix of {n} rows and columns")
         return np.asarray(scipy.linalg.circulant(np.roll(_padded(h, (n,)), -start)), dtype=np.float64)
+    rows = n + h.size - 1
+    require_memory(_MATRIX_BYTES * n * rows, f"a matrix of {rows} rows and {n} columns")
     first_row = np.zeros(n)
     first_row[0] = h[0]
     matrix = np.asarray(scipy.linalg.toeplitz(_padded(h, (n + h.size - 1,)), first_row), dtype=np.float64)
@@ -212,8 +221,9 @@ def adjoint_mismatch(operator: LinearOperator, *, seed: int = 0) -> float:
     rng = np.random.default_rng(seed)
     f, g = (rng.standard_normal(n) for n in (operator.shape[1], operator.shape[0]))
     forward = operator.matvec(f)
+    forward, unit = in_unit(np.asarray(forward, dtype=np.float64))
     scale = float(np.linalg.norm(forward) * np.linalg.norm(g))
-    return abs(float(forward @ g - f @ operator.rmatvec(g))) / scale if scale > 0 else 0.0
+    return abs(float(forward @ g - f @ (operator.rmatvec(g) / unit))) / scale if scale > 0 else 0.0
 
 
 def transform(samples: Array, grid: tuple[int, ...]) -> NDArray[np.complex128]:
@@ -243,14 +253,16 @@ def kernel_origin(shape: tuple[int, ...], mode: Mode, origin: Sequence[int] | No
     one_of(mode, get_args(Mode), "mode")
     if origin is None:
         return tuple(k // 2 for k in shape)
-    if len(origin) != len(shape) or any(not 0 <= o < k for o, k in zip(origin, shape, strict=False)):
+    if len(origin) != len(shape) or any(
+        not (isinstance(o, (int, np.integer)) and 0 <= o < k) for o, k in zip(origin, shape, strict=False)
+    ):
         raise InputError(f"is {tuple(origin)}; give one sample inside the kernel of shape {shape}", field="origin")
     return tuple(int(o) for o in origin)
 
 
 def checked_shape(shape: Sequence[int], ndim: int, field: str) -> tuple[int, ...]:
     """A shape of that many axes of at least one sample each."""
-    if len(shape) != ndim or any(int(n) != n or n < 1 for n in shape):
+    if len(shape) != ndim or any(not isinstance(n, (int, np.integer)) or n < 1 for n in shape):
         raise InputError(
             f"is {tuple(shape)}; give {ndim} whole numbers >= 1, one for each axis of the kernel", field=field
         )
@@ -266,3 +278,12 @@ def _shaped(values: ArrayLike, shape: tuple[int, ...], field: str) -> Array:
     if samples.shape != shape:
         raise InputError(f"has shape {samples.shape} where the operator takes {shape}", field=field)
     return samples
+
+
+def _finite(product: Callable[[Array], Array], factor: Array, field: str) -> Array:
+    """The product, refused where it is not finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = product(factor)
+    if not np.all(np.isfinite(found)):
+        raise InputError("convolved with the kernel leaves the range of float64; use other units", field=field)
+    return found

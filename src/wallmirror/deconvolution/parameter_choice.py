@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
@@ -67,10 +68,14 @@ def discrepancy_alpha(
     """
     target = positive(factor, "factor") * positive(noise_norm, "noise_norm")
     residual: Callable[[float], float]
+    unit = 1.0
     if isinstance(residual_norm, Spectrum):
         lowest, highest = _range(residual_norm)
-        low, high = low or lowest * _ROUNDING**2, high or highest
-        residual = residual_norm.residual_norm
+        low = lowest * _ROUNDING**2 if low is None else low
+        high = highest if high is None else high
+        # In the spectrum's own unit, where the residual at the lowest alpha is no zero.
+        residual, unit = replace(residual_norm, unit=1.0).residual_norm, residual_norm.unit
+        target /= unit
     elif low is None or high is None:
         raise InputError("a function of alpha needs `low` and `high`", field="residual_norm")
     else:
@@ -78,8 +83,8 @@ def discrepancy_alpha(
     at_low, at_high = residual(positive(low, "low")), residual(positive(high, "high"))
     if not at_low < target < at_high:
         raise UndeterminedError(
-            f"no alpha from {low:.2g} to {high:.2g} leaves a residual of {target:.4g}: it runs from {at_low:.4g} to "
-            f"{at_high:.4g}; check the noise's size"
+            f"no alpha from {low:.2g} to {high:.2g} leaves a residual of {target * unit:.4g}: it runs from "
+            f"{at_low * unit:.4g} to {at_high * unit:.4g}; check the noise's size"
         )
     root = brentq(lambda t: math.log(residual(math.exp(t)) / target), math.log(low), math.log(high), xtol=1e-12)
     return math.exp(root)
@@ -91,7 +96,8 @@ def gcv(spectrum: Spectrum, alpha: float) -> float:
     # No freedom is left where the estimate fits every datum: no prediction, so nothing to prefer.
     if freedom <= spectrum.samples * np.finfo(np.float64).eps:
         return math.inf
-    return spectrum.samples * (spectrum.residual_norm(alpha) / freedom) ** 2
+    root = spectrum.residual_norm(alpha) / freedom
+    return spectrum.samples * root * root
 
 
 def gcv_alpha(spectrum: Spectrum) -> float:
@@ -111,26 +117,26 @@ def gcv_alpha(spectrum: Spectrum) -> float:
     >>> 1e-6 < gcv_alpha(spectrum) < 1.0
     True
     """
-    return _minimum(spectrum, lambda alpha: gcv(spectrum, alpha), "generalised cross-validation has no minimum")
+    scaled = replace(spectrum, unit=1.0)  # its square may leave the range of float64
+    return _minimum(spectrum, lambda alpha: gcv(scaled, alpha), "generalised cross-validation has no minimum")
 
 
 def l_curve_curvature(spectrum: Spectrum, alpha: float) -> float:
     """Curvature of (log |g - H f_alpha|, log |f_alpha|) along log alpha; positive at a corner (Hansen 1992)."""
-    s2 = spectrum.power
-    weighted = spectrum.multiplicity * s2 * spectrum.energy
-    # R = |g - H f|^2 and E = |f|^2 have dE/da = -2 A, dR/da = 2 a A with A, B below.
-    a = float(np.sum(weighted / (s2 + alpha) ** 3))
-    b = float(np.sum(weighted / (s2 + alpha) ** 4))
-    residual, signal = spectrum.residual_norm(alpha) ** 2, spectrum.signal_norm(alpha) ** 2
-    if residual == 0 or signal == 0:
+    # With w = alpha / (s^2 + alpha) and R = |g - H f|^2, E = |f|^2, alpha E and the derivatives of R and alpha E in t = log
+    # alpha are sums of |u_i^* g|^2 (1 - w) w^n, which know no scale.
+    w = positive(alpha, "alpha") / (spectrum.power + alpha)
+    share = spectrum.multiplicity * spectrum.energy * (spectrum.power / (spectrum.power + alpha))
+    first, second, third = (float(np.sum(share * w**n)) for n in (1, 2, 3))
+    residual = spectrum.outside + float(np.sum(spectrum.multiplicity * spectrum.energy * w * w))
+    if residual == 0 or first == 0:
         return 0.0
-    # First and second derivatives in t = log alpha of u = log sqrt R and v = log sqrt E.
-    r_t, e_t = 2 * alpha**2 * a, -2 * alpha * a
-    r_tt = r_t + alpha**2 * (2 * a - 6 * alpha * b)
-    e_tt = e_t + alpha**2 * 6 * b
-    u_t, v_t = 0.5 * r_t / residual, 0.5 * e_t / signal
+    r_t, e_t = 2 * second, -2 * second
+    r_tt, e_tt = 4 * second - 6 * third, -2 * second + 6 * third
+    # Derivatives of u = log sqrt R and v = log sqrt E.
+    u_t, v_t = 0.5 * r_t / residual, 0.5 * e_t / first
     u_tt = 0.5 * (r_tt / residual - (r_t / residual) ** 2)
-    v_tt = 0.5 * (e_tt / signal - (e_t / signal) ** 2)
+    v_tt = 0.5 * (e_tt / first - (e_t / first) ** 2)
     speed = u_t**2 + v_t**2
     return (u_t * v_tt - v_t * u_tt) / speed**1.5 if speed > 0 else 0.0
 

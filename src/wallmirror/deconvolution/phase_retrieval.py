@@ -9,6 +9,7 @@ At beta = infinity h_f is a spike and the other channels are their correlations 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 from threadpoolctl import threadpool_limits
 
-from wallmirror.deconvolution.channels import finite_array
+from wallmirror.deconvolution.checking import count, in_unit, real_samples
 from wallmirror.deconvolution.interferometry import pairs
 from wallmirror.deconvolution.levenberg import descend
 from wallmirror.errors import InputError, UndeterminedError
@@ -60,7 +61,7 @@ def retrieve_channels(
     Raises
     ------
     InputError
-        If shapes disagree, or there is no such nearest channel.
+        If shapes disagree, a value or weight is not finite, or there is no such nearest channel.
     UndeterminedError
         For a table in which no channel, or not the nearest, has energy.
 
@@ -72,16 +73,22 @@ def retrieve_channels(
     >>> aligned_error(retrieve_channels(cross_correlations(h), 3).channels, h) < 1e-8
     True
     """
-    h_ij = finite_array(correlations, "correlations", 2)
+    h_ij, unit = in_unit(real_samples(correlations, "correlations", ndim=2))
+    count(channels, "channels")
     if h_ij.shape[0] != channels * (channels + 1) // 2 or h_ij.shape[1] % 2 == 0:
         raise InputError(
             f"has shape {h_ij.shape}; {channels} channels have {channels * (channels + 1) // 2} pairs, over an odd "
             "number of lags",
             field="correlations",
         )
-    if nearest is not None and not 0 <= nearest < channels:
+    if nearest is not None and not (isinstance(nearest, (int, np.integer)) and 0 <= nearest < channels):
         raise InputError(f"is {nearest}; give the index of one of {channels} channels", field="nearest")
-    problem = _Problem(h_ij, channels)
+    if len(weights) == 0 or not all(0 <= weight < np.inf for weight in weights):
+        raise InputError(f"is {tuple(weights)}; give finite weights >= 0", field="weights")
+    if not isinstance(steps, (int, np.integer)) or steps < 0:
+        raise InputError(f"is {steps}; give a whole number >= 0", field="steps")
+    root = math.ldexp(1.0, (math.frexp(unit)[1] - 1) // 2)  # the channels' unit: that of the correlations is its square
+    problem = _Problem(h_ij * (unit / root / root), channels)
     if not np.any(problem.power > 0):
         raise UndeterminedError(
             "no channel has a positive auto-correlation at lag 0, so these are correlations of no channels; the "
@@ -104,7 +111,7 @@ def retrieve_channels(
             x, taken = end.point, taken + end.steps
     problem.focus_on(nearest, 0.0)
     misfit = float(np.sqrt(2 * problem.cost(x) / power))
-    return RetrievedChannels(x.reshape(channels, -1), nearest, misfit, taken)
+    return RetrievedChannels(root * x.reshape(channels, -1), nearest, misfit, taken)
 
 
 class _Problem:

@@ -26,12 +26,15 @@ from numpy.typing import ArrayLike
 from scipy.sparse.linalg import LinearOperator, aslinearoperator
 from scipy.special import kl_div
 
-from wallmirror.deconvolution.checking import ROUNDING, Array, count, nonnegative_samples, one_of, positive
+from wallmirror.arithmetic import power_of_two, rescaled
+from wallmirror.deconvolution.checking import ROUNDING, Array, count, in_unit, nonnegative_samples, one_of, positive
 from wallmirror.errors import InputError
 
 Acceleration = Literal["none", "biggs-andrews"]
 #: Why an iteration ended.
 StoppedBy = Literal["iterations", "relative change", "discrepancy"]
+
+_PLAIN = 1e-100  # scales from here to its reciprocal need no unit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,8 +111,8 @@ def richardson_lucy(
     Raises
     ------
     InputError
-        For data, start, background or operator below zero, or data that H cannot reach from the start. Nothing is
-        clipped.
+        For data, start, background or operator below zero or not finite, data that H cannot reach from the start, a start
+        more than 1e100 times brighter or darker than the data, or a result outside the range of float64. Nothing is clipped.
 
     Notes
     -----
@@ -127,7 +130,9 @@ def richardson_lucy(
     step = RichardsonLucyStep(operator, data, background=background)
     count(iterations, "iterations")
     one_of(acceleration, get_args(Acceleration), "acceleration")
-    target = _target(noise, step.data.size)
+    target = _target(noise, step.data.size, step.unit)
+    if not 0 <= relative_change < math.inf:
+        raise InputError(f"is {relative_change:g}; give a finite number >= 0", field="relative_change")
     f = step.constant_start() if start is None else step.checked_start(start)
     previous = f
     moves: list[Array] = []
@@ -155,16 +160,19 @@ def richardson_lucy(
             stopped_by = "relative change"
             break
     return RichardsonLucy(
-        signal=f.reshape(step.signal_shape if start is None else np.shape(start)),
+        signal=step.in_units(f).reshape(step.signal_shape if start is None else np.shape(start)),
         iterations=len(changes),
         stopped_by=stopped_by,
-        misfit=np.array(misfits),
+        misfit=rescaled(np.array(misfits), step.unit, field="data"),
         change=np.array(changes),
     )
 
 
 class RichardsonLucyStep:
     """What every iteration on the same operator and data shares; vectors are flat.
+
+    Data and background are held in units of a power of two, `unit`, and the signal in units of `unit` over another where the
+    operator's scale is extreme, so that neither quotients nor norms leave the range of float64.
 
     Parameters
     ----------
@@ -174,10 +182,10 @@ class RichardsonLucyStep:
 
     def __init__(self, operator: Any, data: ArrayLike, *, background: float = 0.0) -> None:
         self._operator: LinearOperator = aslinearoperator(operator)
-        self.data = nonnegative_samples(data, "data").ravel()
+        self.data, self.unit = in_unit(nonnegative_samples(data, "data").ravel())
         if not (math.isfinite(background) and background >= 0):
             raise InputError(f"is {background:g}; give a finite number >= 0", field="background")
-        self.background = float(background)
+        self.background = float(background) / self.unit
         if self._operator.shape[0] != self.data.size:
             raise InputError(
                 f"has {self.data.size} samples where the operator gives {self._operator.shape[0]}", field="data"
@@ -185,10 +193,17 @@ class RichardsonLucyStep:
         if not getattr(operator, "nonnegative", True) or (isinstance(operator, np.ndarray) and operator.min() < 0):
             raise InputError("has entries below zero; Richardson-Lucy takes an operator >= 0", field="operator")
         self.signal_shape: tuple[int, ...] = getattr(operator, "signal_shape", (self._operator.shape[1],))
-        reached = self._operator.rmatvec(np.ones(self.data.size))
+        with np.errstate(over="ignore", invalid="ignore"):
+            reached = np.asarray(self._operator.rmatvec(np.ones(self.data.size)), dtype=np.float64)
+        if not np.all(np.isfinite(reached)):
+            raise InputError("holds a value that is not finite, or a sum of them is not", field="operator")
         largest = float(reached.max())
         if largest <= 0:
             raise InputError("sends no light to the data: all of it is zero, or some below zero", field="operator")
+        unit = power_of_two(reached)
+        self._reach = unit if not _PLAIN <= unit <= 1 / _PLAIN else 1.0
+        if self._reach != 1:
+            reached, largest = reached / self._reach, largest / self._reach
         unseen = reached <= ROUNDING * largest
         self._reached = np.where(unseen, 1.0, reached)
         self._unseen = unseen if unseen.any() else None
@@ -202,6 +217,13 @@ class RichardsonLucyStep:
     def checked_start(self, start: ArrayLike) -> Array:
         """The given start, flat, where it can explain the data."""
         f = nonnegative_samples(start, "start").ravel()
+        relative = float(f.max()) / self.unit * self._reach
+        if relative > 0 and not _PLAIN <= relative <= 1 / _PLAIN:
+            raise InputError(
+                f"peaks at {f.max():.3g}, out of all proportion to the data; give a start of about their light",
+                field="start",
+            )
+        f = f / self.unit * self._reach
         if f.size != self._reached.size:
             raise InputError(f"has {f.size} samples where the operator takes {self._reached.size}", field="start")
         prediction = self.predict(f)
@@ -217,11 +239,15 @@ class RichardsonLucyStep:
     def predict(self, f: Array) -> Array:
         """H f + b."""
         prediction: Array = np.asarray(self._operator.matvec(f))
+        if self._reach != 1:
+            prediction = prediction / self._reach
         return prediction + self.background if self.background > 0 else prediction
 
     def update(self, f: Array, prediction: Array) -> Array:
         """f / (H^T 1) * H^T (g / prediction)."""
         factor = np.array(self._operator.rmatvec(self.data / self._above_rounding(prediction)))
+        if self._reach != 1:
+            factor /= self._reach
         np.maximum(factor, 0.0, out=factor)
         factor /= self._reached
         if self._unseen is not None:
@@ -230,16 +256,20 @@ class RichardsonLucyStep:
         return factor
 
     def deviance(self, prediction: Array) -> float:
-        """2 sum g log(g / p) - g + p: twice what the Poisson log likelihood is short of its largest value."""
+        """2 sum g log(g / p) - g + p over `unit`: twice what the Poisson log likelihood is short of its largest value."""
         return 2 * float(np.sum(kl_div(self.data, self._above_rounding(prediction))))
+
+    def in_units(self, f: Array) -> Array:
+        """A signal of the iteration in the units of data and operator."""
+        return rescaled(f, self.unit, 1 / self._reach, field="data")
 
     def _above_rounding(self, prediction: Array) -> Array:
         return np.maximum(prediction, max(ROUNDING * float(prediction.max()), np.finfo(np.float64).tiny))
 
 
-def _target(noise: str | float, samples: int) -> float | None:
-    """The misfit that the noise explains."""
+def _target(noise: str | float, samples: int, unit: float) -> float | None:
+    """The misfit that the noise explains, over the unit of the data."""
     if isinstance(noise, str):
         one_of(noise, ("unknown", "poisson"), "noise")
-        return float(samples) if noise == "poisson" else None
-    return positive(noise, "noise")
+        return samples / unit if noise == "poisson" else None
+    return positive(noise, "noise") / unit

@@ -20,7 +20,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
-from wallmirror.deconvolution.checking import Array, positive, real_samples
+from wallmirror.arithmetic import rescaled
+from wallmirror.deconvolution.checking import Array, in_unit, positive, real_samples, require_squares
 from wallmirror.deconvolution.operators import inverse, kernel_origin, transform
 from wallmirror.errors import InputError
 
@@ -43,6 +44,9 @@ class Spectrum:
         How many components each entry stands for (2 for a pair of conjugate frequencies), broadcastable.
     outside:
         Squared norm of what no f reaches, |g - U U^* g|^2.
+    unit:
+        Power of two in units of which `coefficients`, `projections` and the root of `outside` are held, so that data of any
+        size can be squared.
     samples:
         Number of samples of g.
     synthesis:
@@ -57,27 +61,36 @@ class Spectrum:
     outside: float
     samples: int
     synthesis: Callable[[NDArray[np.complex128] | Array], Array] = field(repr=False)
+    unit: float = 1.0
 
     def solve(self, alpha: float) -> Array:
         """The estimate f_alpha of eq. 3.13."""
-        return self.synthesis(self.coefficients / (self.power + positive(alpha, "alpha")))
+        return rescaled(
+            self.synthesis(self.coefficients / (self.power + positive(alpha, "alpha"))), self.unit, field="data"
+        )
 
     def residual_norm(self, alpha: float) -> float:
         """|g - H f_alpha|; grows with alpha."""
-        return math.sqrt(self.outside + self._sum((alpha / (self.power + alpha)) ** 2 * self.energy))
+        inside = self._norm(positive(alpha, "alpha") / (self.power + alpha) * self._magnitudes)
+        return math.hypot(math.sqrt(self.outside), inside) * self.unit
 
     def signal_norm(self, alpha: float) -> float:
         """|f_alpha|, of the whole estimate before any cropping; falls with alpha."""
-        return math.sqrt(self._sum(self.power / (self.power + alpha) ** 2 * self.energy))
+        return self._norm(self.singular_values / (self.power + positive(alpha, "alpha")) * self._magnitudes) * self.unit
 
     def freedom(self, alpha: float) -> float:
         """Trace of I - H (H^T H + alpha I)^-1 H^T: how many of the data the estimate leaves free."""
-        return self.samples - self._sum(self.power / (self.power + alpha))
+        return self.samples - self._sum(self.power / (self.power + positive(alpha, "alpha")))
 
     @cached_property
     def energy(self) -> Array:
-        """|u_i^* g|^2, shape of `power`."""
+        """|u_i^* g|^2 in units of `unit` squared, shape of `power`."""
         return self.projection_power * _squared(self.projections)
+
+    @cached_property
+    def _magnitudes(self) -> Array:
+        """|u_i^* g| in units of `unit`."""
+        return np.sqrt(self.energy)
 
     @property
     def singular_values(self) -> Array:
@@ -95,6 +108,11 @@ class Spectrum:
     def _sum(self, terms: Array) -> float:
         return float(np.sum(self.multiplicity * terms))
 
+    def _norm(self, terms: Array) -> float:
+        """Root of the sum of squares, which need not lie in float64's range themselves."""
+        scaled, unit = in_unit(terms)
+        return unit * math.sqrt(self._sum(scaled * scaled))
+
 
 def matrix_spectrum(matrix: ArrayLike, data: ArrayLike) -> Spectrum:
     """Singular value decomposition of a dense H, shape (m, n), with data g, shape (m,).
@@ -109,6 +127,8 @@ def matrix_spectrum(matrix: ArrayLike, data: ArrayLike) -> Spectrum:
     g = real_samples(data, "data", ndim=1)
     if h.shape[0] != g.size:
         raise InputError(f"has {g.size} samples where the matrix has {h.shape[0]} rows", field="data")
+    require_squares(h, "matrix")
+    g, unit = in_unit(g)
     u, s, vh = scipy.linalg.svd(h, full_matrices=False)
     inside = u.T @ g
     missed = g - u @ inside if h.shape[0] > s.size else np.zeros(1)
@@ -121,6 +141,7 @@ def matrix_spectrum(matrix: ArrayLike, data: ArrayLike) -> Spectrum:
         outside=float(missed @ missed),
         samples=g.size,
         synthesis=lambda components: np.asarray(vh.T @ components, dtype=np.float64),
+        unit=unit,
     )
 
 
@@ -149,10 +170,13 @@ def convolution_spectrum(
     Raises
     ------
     InputError
-        For values that are not real and finite, or a kernel with more samples than the data.
+        For values that are not real and finite, a kernel beyond 1e-120 to 1e120, whose square is no float64, or one with
+        more samples than the data.
     """
     g = real_samples(data, "data")
     h = real_samples(kernel, "kernel", ndim=g.ndim)
+    require_squares(h, "kernel")
+    g, unit = in_unit(g)
     start = kernel_origin(h.shape, mode, origin)
     if mode not in ("full", "periodic"):
         raise InputError(f'is "{mode}"; choose "full" or "periodic", or use `tikhonov_lsmr`', field="mode")
@@ -189,6 +213,7 @@ def convolution_spectrum(
         outside=0.0,
         samples=g.size,
         synthesis=lambda components: inverse(np.asarray(components, dtype=np.complex128), g.shape)[kept],
+        unit=unit,
     )
 
 

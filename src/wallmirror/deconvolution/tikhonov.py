@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse.linalg import aslinearoperator, lsmr
 
-from wallmirror.deconvolution.checking import Array, count, positive, real_samples
+from wallmirror.arithmetic import rescaled
+from wallmirror.deconvolution.checking import Array, count, in_unit, positive, real_samples, require_squares
 from wallmirror.deconvolution.spectrum import convolution_spectrum, matrix_spectrum
 from wallmirror.errors import InputError, UndeterminedError
 
@@ -111,6 +112,8 @@ def tikhonov_lsmr(
 
     Raises
     ------
+    InputError
+        Where data do not match the operator, or H^T g has a square that float64 cannot hold.
     UndeterminedError
         If that many iterations do not reach the tolerance.
 
@@ -122,10 +125,12 @@ def tikhonov_lsmr(
     [1.0, 1.0]
     """
     linear = aslinearoperator(operator)
-    g = real_samples(data, "data").ravel()
+    g, unit = in_unit(real_samples(data, "data").ravel())
+    positive(tolerance, "tolerance")
     if linear.shape[0] != g.size:
         raise InputError(f"has {g.size} samples where the operator gives {linear.shape[0]}", field="data")
     limit = max(1000, *linear.shape) if max_iterations is None else count(max_iterations, "max_iterations")
+    require_squares(np.asarray(linear.rmatvec(g)), "operator")
     f, istop, iterations, *_ = lsmr(
         linear, g, damp=math.sqrt(positive(alpha, "alpha")), atol=tolerance, btol=tolerance, conlim=0, maxiter=limit
     )
@@ -134,4 +139,4 @@ def tikhonov_lsmr(
             f"LSMR has not converged in {iterations} iterations at alpha {alpha:g}; allow more, or a larger alpha or "
             "tolerance"
         )
-    return np.asarray(f).reshape(getattr(operator, "signal_shape", (-1,)))
+    return rescaled(f, unit, field="data").reshape(getattr(operator, "signal_shape", (-1,)))

@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import f as f_distribution
@@ -31,7 +32,7 @@ from scipy.stats import f as f_distribution
 from wallmirror.derendering.convex import solve_positive
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.facets import FITTED, PRIOR_STD, Factor, logarithm
-from wallmirror.derendering.likelihood import information
+from wallmirror.derendering.information import information
 from wallmirror.derendering.moments import moments
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import design_matrices
@@ -40,6 +41,7 @@ Array = NDArray[np.float64]
 
 _TOLERANCE = 1e-5
 _RIDGE = 1e-10
+_ROUNDING = 1e-9
 # Pixels over which a variance is averaged: its estimate from few samples must hardly know of the pixel's own noise.
 _NEIGHBOURS = 31
 #: Chance of a score so high at which the angle sum is rejected, if the pattern would turn by more than its error bars.
@@ -160,31 +162,51 @@ def _derivatives(
     """For each factor the change of the films that no r and V make, (P, B), and how V then turns, (M, B), per exponent."""
     grid, r, source = estimate.grid, estimate.coefficients, estimate.source
     kernel = problem.kernel(math.degrees(grid.step), _TOLERANCE)
-    designs = estimate.designs or design_matrices(kernel, grid)
-    data = moments(problem.data, designs, weights)
-    schur, inverse, coupled = information(data, r, source)
-    cells = np.flatnonzero(data.seen)
-    level = float(np.trace(schur)) / max(1, cells.size)
+    designs = design_matrices(kernel, grid) if estimate.designs is None else estimate.designs
+    known = estimate.information
+    if known is None or not _alike(weights, problem.fit_weights):
+        known = information(moments(problem.data, designs, weights), r, source)
+    cells = np.flatnonzero(known.seen)
+    level = float(np.trace(known.schur)) / max(1, cells.size)
     # The gauge keeps r off the scale's null direction; the ridge is for barely seen cells.
-    schur += level * np.outer(r[cells], r[cells]) / max(float(r[cells] @ r[cells]), 1e-300)
+    schur = known.schur + level * np.outer(r[cells], r[cells]) / max(float(r[cells] @ r[cells]), 1e-300)
     schur[np.diag_indices_from(schur)] += _RIDGE * level
     lit = kernel.weight * grid.evaluate(r, kernel.angle_sum)
-    films = [
-        np.sum(lit * logarithm(k, kernel.theta_s, kernel.theta_o), axis=-1).reshape(estimate.transport.shape) @ source
+    # The change of F, (P, M), and that of the films as J and F see them: T_i^T W m_b, (B, M, K).
+    changes = [
+        np.sum(lit * logarithm(k, kernel.theta_s, kernel.theta_o), axis=-1).reshape(estimate.transport.shape)
         for k in factors
-    ]  # (P, B) each
+    ]
+    backs = [_back(designs, weights, change, source) for change in changes]
+    along_v = [back @ r for back in backs]
+    right = [
+        np.einsum("ib,bik->k", source, back)[cells] - np.einsum("bmk,bm->k", known.coupled, along)
+        for back, along in zip(backs, along_v, strict=True)
+    ]
+    steps = np.zeros((len(factors), r.size))
+    steps[:, cells] = solve_positive(schur, np.stack(right, axis=1)).T
     unexplained, turns = [], []
-    for film in films:
-        back = np.stack([(t.T @ (weights * film)).T for t in designs], axis=1)  # T_i^T W m_b, (B, M, K)
-        along_v = back @ r
-        right = np.einsum("ib,bik->k", source, back)[cells] - np.einsum("bmk,bm->k", coupled, along_v)
-        dr = np.zeros_like(r)
-        dr[cells] = solve_positive(schur, right)
-        dv = (np.einsum("bij,bj->bi", inverse, along_v) - np.einsum("bmk,k->bm", coupled, dr[cells])).T
+    for change, along, dr in zip(changes, along_v, steps, strict=True):
+        dv = (np.einsum("bij,bj->bi", known.inverse, along) - np.einsum("bmk,k->bm", known.coupled, dr[cells])).T
         moved = np.stack([t @ dr for t in designs], axis=1)
-        unexplained.append(film - moved @ source - estimate.transport @ dv)
+        unexplained.append((change - moved) @ source - estimate.transport @ dv)
         turns.append(-dv + source * (np.sum(dv * source) / np.sum(source**2)))
     return unexplained, turns
+
+
+def _alike(weights: Array, others: Array) -> bool:
+    """Whether two kinds of weights are the same but for the rounding of an average."""
+    return weights.shape == others.shape and bool(np.all(np.abs(weights - others) <= _ROUNDING * others))
+
+
+def _back(designs: list[sp.csr_array], weights: Array, change: Array, source: Array) -> Array:
+    """T_i^T W_b (dF v_b), shape (B, M, K)."""
+    if weights.shape[1] > 1:
+        weighted = weights * (change @ source)
+        return np.stack([(t.T @ weighted).T for t in designs], axis=1)
+    # Where all realisations share their weights, M columns do for B.
+    few = np.stack([(t.T @ (weights * change)).T for t in designs], axis=1)
+    return np.asarray(np.tensordot(source.T, few, axes=1))
 
 
 def in_words(exponents: Mapping[Any, float]) -> str:

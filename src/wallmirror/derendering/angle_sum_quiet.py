@@ -31,6 +31,7 @@ from wallmirror.geometry import incident_angles, outgoing_angles, wall_points
 
 Array = NDArray[np.float64]
 
+_TOLERANCE = 1e-9
 # Mismatch below which there is nothing but rounding.
 _ROUNDING = 1e-22
 # Numbers that what is left by chance is made of, at least: a spline's error changes sign with every few knots.
@@ -53,7 +54,10 @@ def check_angle_sum_quietly(
     space:
         Of the data.
     """
-    designs = problem.weighted(estimate.designs)
+    grid, designs = estimate.grid, estimate.designs
+    if designs is None:
+        _, designs = problem.designs(math.degrees(grid.step), degree=grid.degree, tolerance=_TOLERANCE)
+    designs = problem.weighted(designs)
     here = estimate.closed
     power = float(np.sum(here.source**2))
     missed = _missed(here, designs, space)

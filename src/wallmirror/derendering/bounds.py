@@ -19,10 +19,18 @@ import scipy.linalg as sl
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from wallmirror.derendering.likelihood import Moments, information
+from wallmirror.derendering.groups import Groups
+from wallmirror.derendering.information import Information, information
+from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.splines import SplineGrid
+from wallmirror.errors import InputError
 
 Array = NDArray[np.float64]
+
+# Share of a bound on V that a ten times larger ridge must leave.
+_KEPT = 0.8
+# The largest entry of a pattern must lie between these.
+_LEAST, _MOST = 1e-50, 1e50
 
 
 @dataclass(frozen=True)
@@ -73,42 +81,55 @@ def cramer_rao(data: Moments, coefficients: Array, source: Array, *, gauge: Arra
         V, shape (M, B).
     gauge:
         c, shape (K,): the values of the basis functions at the peak of rho.
+
+    Raises
+    ------
+    InputError
+        For a pattern whose powers leave the range of float64.
     """
-    schur, inverse, coupled = information(data, coefficients, source)
-    return bound_of(schur, inverse, coupled, seen=data.seen, coefficients=coefficients, source=source, gauge=gauge)
+    require_order_one(source)
+    return bound_of(information(data, coefficients, source), coefficients=coefficients, source=source, gauge=gauge)
+
+
+def require_order_one(source: Array) -> None:
+    """Refuse a pattern whose squares, weighted, float64 cannot hold."""
+    largest = float(np.max(np.abs(source), initial=0.0))
+    if not _LEAST <= largest <= _MOST:
+        raise InputError(f"is {largest:g} at most; bring it near one, and the noise along", field="source")
 
 
 def bound_of(
-    schur: Array,
-    inverse: Array,
-    coupled: Array,
+    known: Information,
     *,
-    seen: NDArray[np.bool_],
     coefficients: Array,
     source: Array,
     gauge: Array,
+    groups: Groups | None = None,
 ) -> Bound:
     """The bound that a Fisher information gives, whatever the noise: normal (`cramer_rao`) or of counts (`poisson`).
 
     Parameters
     ----------
-    schur, inverse, coupled:
-        S over the seen coefficients (K', K'), H_b^-1 (B, M, M) and H_b^-1 C_b (B, M, K').
-    seen:
-        Which of the K coefficients those are, shape (K,).
+    known:
+        The information at (r, V).
     coefficients, source, gauge:
         As for `cramer_rao`.
+    groups:
+        Of elements that have a scale each: then `gauge` has a row for each, (G, K).
     """
-    c, r = gauge[seen], coefficients[seen]
-    strength = float(np.trace(schur)) / max(1, schur.shape[0]) / max(float(c @ c), 1e-300)
-    pinned = schur + strength * np.outer(c, c)
+    schur, inverse, coupled, seen = known.schur, known.inverse, known.coupled, known.seen
+    c, r = np.atleast_2d(gauge)[:, seen], coefficients[seen]
+    # A null direction of S for each scale that is free: the group's part of r.
+    null = r[None] if groups is None else np.where(groups.cells[:, seen], r, 0.0)
+    patterns = source.T[None] if groups is None else np.stack([_only(source, each).T for each in groups.elements])
+    strength = float(np.trace(schur)) / max(1, schur.shape[0]) / max(float(np.sum(c * c)), 1e-300) * len(c)
+    pinned = schur + strength * c.T @ c
     # Barely seen cells: a ridge far below their neighbours' information keeps their (huge) variance finite.
     # And no ridge below the rounding of S, which subtracts C^T H^-1 C with the condition of H.
     lost = max(1e-12, 4 * np.finfo(np.float64).eps * float(np.max(np.linalg.cond(inverse))))
     ridge = lost * float(np.trace(schur)) / max(1, schur.shape[0])
-    along = float(c @ r)
-
-    scale = np.zeros_like(r) if along == 0 else r / (math.sqrt(strength) * along)
+    along = np.sum(c * null, axis=1, keepdims=True)
+    scale = np.divide(null, math.sqrt(strength) * along, out=np.zeros_like(null), where=along != 0)
     rows = coupled.reshape(-1, r.size)
 
     def factor(ridge: float) -> Array:
@@ -122,13 +143,16 @@ def bound_of(
             lower = factor(ridge)
         except np.linalg.LinAlgError:  # rounding took more than it should: what is left is no bound
             ridge, sound = 100 * max(ridge, 1e-290), False
-    covariance = _inverse(lower) - np.outer(scale, scale)
+    covariance = _inverse(lower) - scale.T @ scale
     spread = (rows @ covariance).reshape(coupled.shape)
-    error = _scale_free_error(source, inverse, coupled, spread)
-    # What the ridge alone holds, nothing holds: a bound on V that falls with it is none.
-    if sound:
-        solved = sl.cho_solve((factor(10 * ridge), True), rows.T, check_finite=False).T - np.outer(rows @ scale, scale)
-        sound = _scale_free_error(source, inverse, coupled, solved.reshape(coupled.shape)) >= 0.8 * error
+    error = _scale_free_error(patterns, inverse, coupled, spread)
+    # What the ridge alone holds, nothing holds: a bound on V that falls with it is none. It is convex in the ridge, so that
+    # its slope tells how far it may fall at most.
+    whole = spread.reshape(rows.shape) + (rows @ scale.T) @ scale  # [H^-1 C] of the pinned information's inverse
+    most = 9 * ridge * float(np.sum(whole * whole)) / max(float(np.sum(source * source)), 1e-300)
+    if sound and not error**2 - most >= (_KEPT * error) ** 2:
+        solved = sl.cho_solve((factor(10 * ridge), True), rows.T, check_finite=False).T - (rows @ scale.T) @ scale
+        sound = _scale_free_error(patterns, inverse, coupled, solved.reshape(coupled.shape)) >= _KEPT * error
     if not sound:
         error = float("inf")
     variance = np.einsum("bii->bi", inverse) + np.sum(spread * coupled, axis=-1)
@@ -136,7 +160,7 @@ def bound_of(
         coefficients=covariance,
         seen=seen,
         source_std=np.sqrt(np.maximum(variance, 0.0)).T,
-        shape_std=_shape_std(source, inverse, coupled, spread, variance),
+        shape_std=_shape_std(patterns, inverse, coupled, spread, variance),
         source_error=error,
     )
 
@@ -150,28 +174,37 @@ def _inverse(lower: Array) -> Array:
     return np.asarray(half + np.tril(half, -1).T, dtype=np.float64)
 
 
-def _shape_std(source: Array, inverse: Array, coupled: Array, spread: Array, variance: Array) -> Array:
-    """Standard deviation of V freed of its part along V: Var(dv - v (v dv) / |v|^2), shape (M, B)."""
-    v = source.T
-    norm = max(float(np.sum(v * v)), 1e-300)
-    pulled = np.einsum("bi,bik->k", v, spread)
-    together = np.einsum("bij,bj->bi", inverse, v) + np.einsum("bik,k->bi", coupled, pulled)
-    along = float(np.sum(v * together))
-    free = variance - 2 * v * together / norm + v * v * along / norm**2
+def _only(source: Array, elements: tuple[int, ...]) -> Array:
+    part = np.zeros_like(source)
+    part[list(elements)] = source[list(elements)]
+    return part
+
+
+def _shape_std(patterns: Array, inverse: Array, coupled: Array, spread: Array, variance: Array) -> Array:
+    """Standard deviation of V freed of its part along each pattern v: Var(dv - v (v dv) / |v|^2), shape (M, B)."""
+    free = variance
+    for v in patterns:
+        norm = max(float(np.sum(v * v)), 1e-300)
+        pulled = np.einsum("bi,bik->k", v, spread)
+        together = np.einsum("bij,bj->bi", inverse, v) + np.einsum("bik,k->bi", coupled, pulled)
+        along = float(np.sum(v * together))
+        free = free - 2 * v * together / norm + v * v * along / norm**2
     return np.asarray(np.sqrt(np.maximum(free, 0.0)).T, dtype=np.float64)
 
 
-def _scale_free_error(source: Array, inverse: Array, coupled: Array, spread: Array) -> float:
-    """sqrt(E |dV|^2) / |V| with dV freed of its part along V, which a global scale absorbs.
+def _scale_free_error(patterns: Array, inverse: Array, coupled: Array, spread: Array) -> float:
+    """sqrt(E |dV|^2) / |V| with dV freed of its part along each pattern (B, M) of its own scale, which that absorbs.
 
     `spread` is [H_b^-1 C_b] Cov(r), shape (B, M, K').
     """
-    v = source.T  # (B, M)
-    norm = float(np.sum(v * v))
-    if norm == 0:
+    norms = np.sum(patterns**2, axis=(1, 2))
+    if not np.sum(norms) > 0:
         return float("inf")
     total = float(np.einsum("bii->", inverse)) + float(np.sum(spread * coupled))
-    # Along V: v^T Cov v / |V|^2.
-    pulled = np.einsum("bi,bik->k", v, coupled)
-    along = float(np.einsum("bi,bij,bj->", v, inverse, v)) + float(np.einsum("bi,bik,k->", v, spread, pulled))
-    return float(np.sqrt(max(total - along / norm, 0.0) / norm))
+    for v, norm in zip(patterns, norms, strict=True):
+        if norm > 0:
+            # Along V: v^T Cov v / |V|^2.
+            pulled = np.einsum("bi,bik->k", v, coupled)
+            along = float(np.einsum("bi,bij,bj->", v, inverse, v)) + float(np.einsum("bi,bik,k->", v, spread, pulled))
+            total -= along / float(norm)
+    return float(np.sqrt(max(total, 0.0) / float(np.sum(norms))))

@@ -19,6 +19,7 @@ from scipy.ndimage import gaussian_filter1d
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import SplineGrid, design_matrices
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, banded_gram, closed_form, signal_space
+from wallmirror.errors import InputError
 from wallmirror.geometry import Card
 from wallmirror.transport import Kernel, build_kernel
 
@@ -29,7 +30,16 @@ _DIFFERENCE = 1e-5
 
 
 def moved(card: Card, offset: float, distance: float, width: float) -> Card:
-    """The card shifted by `offset` metres, its distance and its width multiplied by positive factors."""
+    """The card shifted by `offset` metres, its distance and its width multiplied by positive factors.
+
+    Raises
+    ------
+    InputError
+        For a factor that is not positive, and where the card would lie beyond what lengths may be.
+    """
+    for name, factor in (("distance", distance), ("width", width)):
+        if not factor > 0:
+            raise InputError(f"is {factor:g}; give a factor above 0", field=name)
     x = np.asarray(card.elements_x)
     centre = float(x.mean())
     return dataclasses.replace(

@@ -73,11 +73,21 @@ def solve_positive(matrix: Array, right: Array) -> Array:
     UndeterminedError
         When no small ridge makes the matrix positive definite.
     """
+    return np.asarray(sl.cho_solve((positive_factor(matrix), True), right, check_finite=False), dtype=np.float64)
+
+
+def positive_factor(matrix: Array) -> Array:
+    """The lower Cholesky factor that `solve_positive` solves with, what lies above its diagonal left as it may be.
+
+    Raises
+    ------
+    UndeterminedError
+        As `solve_positive`.
+    """
     for ridge in (0.0, 1e-11, 1e-9, 1e-7):
         try:
             raised = matrix + ridge * np.mean(np.diag(matrix)) * np.eye(matrix.shape[0]) if ridge else matrix
-            factor = sl.cho_factor(raised, lower=True, check_finite=False)
-            return np.asarray(sl.cho_solve(factor, right, check_finite=False), dtype=np.float64)
+            return np.asarray(sl.cho_factor(raised, lower=True, check_finite=False)[0], dtype=np.float64)
         except np.linalg.LinAlgError:
             continue
     raise UndeterminedError("the captures leave the pattern undetermined; capture more light, views or patterns")

@@ -15,26 +15,50 @@ from wallmirror.derendering.estimate import Estimate, doubts_of_fit
 from wallmirror.derendering.knots import NOISY_STEPS, refine
 from wallmirror.derendering.patterns import trusted_bound
 from wallmirror.derendering.poisson import maximise_poisson, poisson_bound
-from wallmirror.derendering.problem import Problem
+from wallmirror.derendering.problem import Problem, prepare
 from wallmirror.derendering.subspace import SignalSpace
+from wallmirror.errors import InputError
 
 Array = NDArray[np.float64]
 
 # Counts that scatter less than this share of what counting makes are none.
 _TOO_QUIET = 0.8
+# Counts of a pixel up to which float64 tells each from the next.
+_MOST_COUNTS = 2.0**53
 
 
-def with_counting_noise(captures: CaptureSet, *, per_radiance: float, background: float) -> CaptureSet:
-    """The captures with variances that counting gives each pixel, its mean over the realisations taken as its rate.
+def prepare_counts(captures: CaptureSet, *, per_radiance: float, background: float) -> tuple[Problem, SignalSpace]:
+    """Captures made ready with the variances that counting gives each pixel, its mean over the realisations taken as its rate.
 
     One variance for all realisations of a pixel keeps the normal fit, which is only the start, cheap. What saturates stays
     out.
+
+    Raises
+    ------
+    InputError
+        For more counts than float64 tells apart.
+    UndeterminedError
+        As `prepare`.
     """
-    mean = np.maximum(captures.radiance.mean(axis=2, keepdims=True), 0.0)
-    variance = np.broadcast_to((mean * per_radiance + max(background, 1.0)) / per_radiance**2, captures.radiance.shape)
-    if captures.variance is not None:
-        variance = np.where(np.isfinite(captures.variance), variance, np.inf)
-    return replace(captures, variance=np.array(variance), variance_is_floor=False)
+    used = np.ones(captures.radiance.shape, dtype=bool) if captures.variance is None else np.isfinite(captures.variance)
+    # In a power of two near the brightest pixel, so that no variance leaves the range of float64.
+    brightest = float(np.abs(captures.radiance).max(initial=0.0, where=used))
+    exponent = math.frexp(brightest)[1]
+    films = np.ldexp(np.clip(captures.radiance, -brightest, brightest), -exponent)
+    with np.errstate(over="ignore", divide="ignore"):
+        each = np.ldexp(per_radiance, exponent)
+        if not each <= _MOST_COUNTS:
+            raise InputError(
+                f"is {per_radiance:g}, which makes {brightest * each / 2.0**exponent:.2g} counts of the brightest pixel; "
+                f"give one that makes {_MOST_COUNTS:.0e} at most",
+                field="counts_per_radiance",
+            )
+        number = np.maximum(np.count_nonzero(used, axis=2, keepdims=True), 1)
+        mean = np.maximum(np.sum(films, axis=2, keepdims=True, where=used) / number, 0.0)
+        variance = np.minimum((mean * each + max(background, 1.0)) / each / each, np.finfo(np.float64).max)
+    counted = replace(captures, radiance=films, variance=np.where(used, variance, np.inf), variance_is_floor=False)
+    problem, space = prepare(counted, weak_patterns=True)
+    return replace(problem, captures=captures, scale=math.ldexp(problem.scale, exponent)), space
 
 
 def solve_counts(
@@ -112,4 +136,5 @@ def solve_counts(
         predicted_error=sigma * bound.source_error,
         chi_squared=fit.chi_squared,
         warnings=tuple(warnings),
+        designs=designs,
     )

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from wallmirror.derendering.information import Information
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm
+from wallmirror.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -41,7 +44,9 @@ class Estimate:
     groups:
         Elements that share a scale, each ascending, where there is more than the one global scale.
     designs:
-        T_1 .. T_M on the grid, (P, K) each, where the method has them at hand.
+        T_1 .. T_M over the grid, each sparse (P, K), where the method made them.
+    information:
+        The Fisher information at r and V with the problem's weights, where the method needed it.
     """
 
     method: str
@@ -59,7 +64,8 @@ class Estimate:
     warnings: tuple[str, ...]
     priors: tuple[str, ...] = ()
     groups: tuple[tuple[int, ...], ...] = ()
-    designs: list[sp.csr_array] = field(default_factory=list, repr=False)
+    designs: list[sp.csr_array] | None = None
+    information: Information | None = None
 
 
 def doubts_of_fit(*, converged: bool, misfit: float | None) -> list[str]:
@@ -78,6 +84,13 @@ def doubts_of_fit(*, converged: bool, misfit: float | None) -> list[str]:
 def scale_free_error(estimate: Array, truth: Array, groups: tuple[tuple[int, ...], ...] = ()) -> float:
     """Relative Frobenius error after the best global scale of the estimate, or the best one of each group of its rows.
 
+    It is inf where the truth is all 0.
+
+    Raises
+    ------
+    InputError
+        For arrays of different shapes, and values that are not finite.
+
     Examples
     --------
     >>> scale_free_error(np.array([2.0, 4.0]), np.array([1.0, 2.0]))
@@ -85,14 +98,23 @@ def scale_free_error(estimate: Array, truth: Array, groups: tuple[tuple[int, ...
     >>> scale_free_error(np.array([[2.0], [9.0]]), np.array([[1.0], [3.0]]), groups=((0,), (1,)))
     0.0
     """
+    arrays = {"estimate": np.asarray(estimate, dtype=np.float64), "truth": np.asarray(truth, dtype=np.float64)}
+    for name, values in arrays.items():
+        if not np.all(np.isfinite(values)):
+            raise InputError("holds a value that is not finite", field=name)
+    if arrays["estimate"].shape != arrays["truth"].shape:
+        raise InputError(f"has shape {arrays['estimate'].shape}; give {arrays['truth'].shape}", field="estimate")
+    if not np.any(arrays["truth"]):
+        return math.inf
     # In units of the largest entry each, so that squares neither overflow nor vanish.
-    found, sought = (
-        np.asarray(values) / (float(np.max(np.abs(values), initial=0.0)) or 1.0) for values in (estimate, truth)
-    )
-    if groups:
-        parts = [list(group) for group in groups]
-        missed = [scale_free_error(found[i], sought[i]) * float(np.linalg.norm(sought[i])) for i in parts]
-        return float(np.linalg.norm(missed) / np.linalg.norm(sought))
+    found, sought = (np.atleast_1d(values) / (float(np.max(np.abs(values))) or 1.0) for values in arrays.values())
+    parts = [list(group) for group in groups] or [list(range(len(sought)))]
+    missed = [_missed(found[part], sought[part]) for part in parts]
+    return float(np.linalg.norm(missed) / np.linalg.norm(sought))
+
+
+def _missed(found: Array, sought: Array) -> float:
+    """Frobenius norm of what the best multiple of an array leaves of another."""
     power = float(np.sum(found * found))
     scale = float(np.sum(found * sought)) / power if power > 0 else 0.0
-    return float(np.linalg.norm(scale * found - sought) / np.linalg.norm(sought))
+    return float(np.linalg.norm(scale * found - sought))

@@ -13,7 +13,8 @@ from threadpoolctl import threadpool_limits
 
 from wallmirror.brdf import AngleSumBRDF
 from wallmirror.derendering.bounds import cramer_rao
-from wallmirror.derendering.likelihood import information, moments
+from wallmirror.derendering.information import information
+from wallmirror.derendering.moments import moments
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
 from wallmirror.errors import InputError
 from wallmirror.geometry import Card, Observer
@@ -23,6 +24,8 @@ Array = NDArray[np.float64]
 
 _DEGREE = 3
 _FINEST_DEG, _COARSEST_DEG = 0.05, 4.0
+# The least standard deviation over the largest that counts: the root of that of the variances in `problem`.
+_FLOOR = 1e-2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +71,8 @@ def foresee(
     source:
         V, shape (M, B).
     noise:
-        Standard deviation of the radiance: a number, or an array that broadcasts to (A, N, B).
+        Standard deviation of the radiance: a number, or an array that broadcasts to (A, N, B). None is taken to be below a
+        hundredth of the largest, as by a solver, where those above the brightest radiance do not count.
     step_deg:
         Knot spacing of the splines among which the BRDF is sought; half of the BRDF's own angular scale if left out.
         A solver that must find finer features knows less.
@@ -100,11 +104,8 @@ def foresee(
         raise InputError("holds a standard deviation that is not positive and finite", field="noise")
     if step_deg is not None and not 0.001 <= step_deg <= 45:
         raise InputError(f"is {step_deg:g}; give a knot spacing from 0.001 to 45 degrees", field="step_deg")
-    # The bound is proportional to the noise, so that it is found for patterns and noise of order one.
-    brightest, level = float(np.abs(source).max()), float(spread.max())
-    source, spread = source / brightest, spread / level
-    with np.errstate(over="ignore"):
-        ratio = float(np.float64(level) / brightest)
+    brightest = float(np.abs(source).max())
+    source = source / brightest
     step = step_deg or min(_COARSEST_DEG, max(_FINEST_DEG, math.degrees(brdf.angular_scale) / 2))
     with threadpool_limits(limits=1, user_api="blas"):
         kernel = build_kernel(observer, card, weights=weights, resolution=2 * math.radians(step), tolerance=1e-5)
@@ -112,7 +113,12 @@ def foresee(
         designs = design_matrices(kernel, grid)
         transport = transport_matrix(observer, card, brdf, weights=weights, tolerance=1e-6)
         films = radiance(transport, source).reshape(-1, source.shape[1])
-        inverse = 1 / spread.reshape(films.shape) ** 2
+        # The bound is proportional to the noise, so that it is found for patterns and noise of order one.
+        with np.errstate(over="ignore"):
+            over = spread / brightest
+            level = float(spread.max(initial=0.0, where=over <= max(float(films.max()), float(np.median(over)))))
+            ratio = float(np.float64(level) / brightest)
+            inverse = np.maximum(spread / level, _FLOOR).reshape(films.shape) ** -2.0
         summed = moments(films, designs, inverse)
         coefficients = closest_spline(grid, brdf)
         peak_at = grid.peak(coefficients, summed.exposure)
@@ -124,7 +130,7 @@ def foresee(
         along = gram @ coefficients[seen]
         power = float(along @ coefficients[seen])
         spilt = float(np.sum(gram * bound.coefficients)) - float(along @ bound.coefficients @ along) / power
-        _, normal, _ = information(summed, coefficients, source)
+        normal = information(summed, coefficients, source).inverse
         known = math.sqrt(float(np.einsum("bii->", normal)) / float(np.sum(source**2)))
     transport_error = ratio * math.sqrt(max(0.0, spilt) / power)
     return Forecast(

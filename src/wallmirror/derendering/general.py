@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg as sl
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from wallmirror.captures import CaptureSet
+from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.general_noisy import NOISY_STEPS, likeliest
 from wallmirror.derendering.general_solution import HOPELESS, GeneralSolution, status, too_few
 from wallmirror.derendering.general_stack import Stack, resolution
@@ -87,8 +88,8 @@ def solve_general(
             beyond = float(np.sum(values[stack.elements :] ** 2))
             if beyond < _NOISELESS:
                 exact = _exact(stack, (step_deg,) if step_deg else _STEPS, tell)
-                if values.size > stack.elements or exact[2].mismatch < _EXACT:
-                    return _exact_solution(stack, *exact)
+                if values.size > stack.elements or exact.closed.mismatch < _EXACT:
+                    return _exact_solution(stack, exact)
         return likeliest(stack, (step_deg,) if step_deg else NOISY_STEPS, tell)
 
 
@@ -112,20 +113,39 @@ def _check(captures: Sequence[CaptureSet], step_deg: float | None) -> None:
         )
 
 
-def _exact(
-    stack: Stack, steps: tuple[float, ...], tell: Callable[[str], None]
-) -> tuple[TableGrid, list[sp.csr_array], ClosedForm]:
-    """Refine the knots while that halves the error bound."""
-    best = None
+@dataclass(frozen=True)
+class _Exact:
+    """The closed form on the knots that were chosen, and the error that it may have."""
+
+    grid: TableGrid
+    designs: list[sp.csr_array]
+    closed: ClosedForm
+    error: float
+
+
+def _exact(stack: Stack, steps: tuple[float, ...], tell: Callable[[str], None]) -> _Exact:
+    """Refine the knots while that halves the error bound.
+
+    Where the films have hardly more pixels than the table has cells, any knots fit them to rounding, and the bound knows of
+    rounding alone: the error is no less than how far the pattern moves on the next-best knots.
+    """
+    best: _Exact | None = None
+    others: list[ClosedForm] = []
     for step in steps:
         grid, designs = stack.designs(step, _DEGREE)
         closed = _polished(stack, designs, stack.closed(designs))
         tell(f"knots every {step:g} deg: mismatch {closed.mismatch:.2g}, gap {closed.gap:.2g}")
-        if best is not None and closed.error > best[2].error / 2:
+        if best is not None and closed.error > best.error / 2:
+            others.append(closed)
             break
-        best = grid, designs, closed
+        if best is not None:
+            others.append(best.closed)
+        best = _Exact(grid, designs, closed, closed.error)
     assert best is not None
-    return best
+    if not others:
+        return best
+    moved = scale_free_error(best.closed.source, min(others, key=lambda other: other.error).source)
+    return replace(best, error=max(best.error, moved))
 
 
 def _polished(stack: Stack, designs: list[sp.csr_array], closed: ClosedForm) -> ClosedForm:
@@ -160,25 +180,27 @@ def _polished(stack: Stack, designs: list[sp.csr_array], closed: ClosedForm) -> 
     return closed
 
 
-def _exact_solution(stack: Stack, grid: TableGrid, designs: list[sp.csr_array], closed: ClosedForm) -> GeneralSolution:
-    if closed.near_solutions > 1 or closed.error > HOPELESS:
+def _exact_solution(stack: Stack, exact: _Exact) -> GeneralSolution:
+    grid, designs, closed, error = exact.grid, exact.designs, exact.closed, exact.error
+    if closed.near_solutions > 1 or error > HOPELESS:
         raise UndeterminedError(too_few(stack, f"gap {closed.gap:.1e}, mismatch {closed.mismatch:.1e}"))
     peak = float(stack.peak(grid, closed.coefficients) @ closed.coefficients)
-    source = closed.source * stack.problem.scale * peak
+    scale = stack.problem.scale * peak
     return GeneralSolution(
         brdf=SplineTable(
             grid=grid,
             coefficients=closed.coefficients / peak,
             determined=resolution(stack, grid, designs, closed.source, 0.0) > _RESOLVED,
         ),
-        source=source,
-        source_std=np.full(source.shape, closed.error * float(np.sqrt(np.mean(source**2)))),
+        source=closed.source * scale,
+        source_std=np.full(closed.source.shape, error * float(np.sqrt(np.mean(closed.source**2))) * scale),
         rank=stack.space.rank,
         mismatch=closed.mismatch,
         gap=closed.gap,
-        predicted_error=closed.error,
+        predicted_error=error,
         chi_squared=math.nan,
         step_deg=math.degrees(grid.theta_s.step),
         method="closed_form",
-        status=status(stack, closed.error, "in closed form"),
+        warnings=(),
+        status=status(stack, error, "in closed form"),
     )

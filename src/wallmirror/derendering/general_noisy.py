@@ -15,6 +15,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from wallmirror.derendering.bounds import Bound, cramer_rao
+from wallmirror.derendering.estimate import doubts_of_fit
 from wallmirror.derendering.general_solution import HOPELESS, GeneralSolution, status, too_few
 from wallmirror.derendering.general_stack import Stack, exposure, resolution
 from wallmirror.derendering.likelihood import Fit, Moments, maximise, moments
@@ -128,6 +129,7 @@ def _likeliest_solution(
         raise UndeterminedError(too_few(stack, why))
     decided = resolution(stack, grid, designs, fit.source, _prior(designs, closed, noise))
     scale = problem.scale * peak
+    warnings = doubts_of_fit(converged=fit.converged, misfit=reduced if problem.noise_is_stated else None)
     return GeneralSolution(
         brdf=SplineTable(grid=grid, coefficients=fit.coefficients / peak, determined=decided > _RESOLVED),
         source=fit.source * scale,
@@ -139,7 +141,8 @@ def _likeliest_solution(
         chi_squared=reduced if problem.noise_is_stated else math.nan,
         step_deg=math.degrees(grid.theta_s.step),
         method="maximum_likelihood",
-        status=status(stack, sigma * bound.source_error, "by maximum likelihood"),
+        warnings=tuple(warnings),
+        status=status(stack, sigma * bound.source_error, "by maximum likelihood", warnings),
     )
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wallmirror.derendering.general_stack import Stack
+from wallmirror.derendering.solution import Verdict
 from wallmirror.derendering.tables import SplineTable
 
 Array = NDArray[np.float64]
@@ -38,6 +40,8 @@ class GeneralSolution:
         Knot spacing in degrees.
     method:
         "closed_form" or "maximum_likelihood".
+    warnings:
+        One sentence for each reason to doubt.
     status:
         A sentence on what was found.
     """
@@ -52,7 +56,13 @@ class GeneralSolution:
     chi_squared: float
     step_deg: float
     method: str
+    warnings: tuple[str, ...]
     status: str
+
+    @property
+    def verdict(self) -> Verdict:
+        """ "good", or "doubtful" when a warning stands."""
+        return "doubtful" if self.warnings else "good"
 
     def seen(self, theta_s: ArrayLike, theta_o: ArrayLike) -> NDArray[np.bool_]:
         """Where the captures determine the table; elsewhere its values come from the ridge."""
@@ -68,9 +78,10 @@ def too_few(stack: Stack, why: str) -> str:
     )
 
 
-def status(stack: Stack, error: float, how: str) -> str:
-    """The sentence that goes with an answer."""
-    return (
+def status(stack: Stack, error: float, how: str, warnings: Sequence[str] = ()) -> str:
+    """The sentence that goes with an answer, and the first reason to doubt it."""
+    found = (
         f"Recovered {stack.elements} elements from {stack.places} positions {how}, without Hypothesis 8; expect the "
         f"pattern to be {100 * error:.2g} % off, up to one global scale."
     )
+    return f"{found} But {warnings[0]}." if warnings else found

@@ -16,12 +16,14 @@ from wallmirror.derendering.problem import (
     Problem,
     patterns_space,
     prepare,
+    require_pixels,
     require_realisations,
     too_few_patterns,
 )
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form
 from wallmirror.derendering.tables import TableGrid
+from wallmirror.errors import UndeterminedError
 from wallmirror.transport import Kernel, build_kernel
 
 Array = NDArray[np.float64]
@@ -61,7 +63,7 @@ class Stack:
             When the positions together do not show as many patterns as the card has elements; one alone need not.
         """
         require_realisations(captures[0].realisations, captures[0].card.elements)
-        parts = [prepare(c, few_captures=True)[0] for c in captures]
+        parts = [_part_of(c, f"capture set {n} of {len(captures)}") for n, c in enumerate(captures, 1)]
         scale = max(p.scale for p in parts)
         ratios = [p.scale / scale for p in parts]
         data = np.concatenate([p.data * ratio for p, ratio in zip(parts, ratios, strict=True)])
@@ -69,6 +71,7 @@ class Stack:
         inverse = None
         if any(p.inverse_variance is not None for p in parts):
             inverse = np.concatenate([_weights(p, ratio, stated) for p, ratio in zip(parts, ratios, strict=True)])
+            require_pixels(inverse, captures[0].card.elements)
         noisy = np.concatenate([p.noisy for p in parts])
         problem = Problem(captures[0], data, inverse, noisy, stated, scale)
         space, _ = patterns_space(problem)
@@ -118,6 +121,13 @@ class Stack:
                 if values[p] > best:
                     best, row = float(values[p]), rows[[p]].toarray()[0]
         return row
+
+
+def _part_of(captures: CaptureSet, name: str) -> Problem:
+    try:
+        return prepare(captures, few_captures=True)[0]
+    except UndeterminedError as refusal:
+        raise UndeterminedError(f"{name}: {refusal}") from None
 
 
 def _weights(part: Problem, ratio: float, stated: bool) -> Array:

@@ -1,13 +1,12 @@
 """The knots that the data choose: the fit on each spacing, and when a finer one pays.
 
-The free maximum of the likelihood on nested grids (`ladder`) chooses; whether finer knots can pay at all is told without a
-fit on them (`finer`). Bounds are imposed on the knots that were chosen, and may send them back to coarser ones.
+The free maximum of the likelihood on nested grids (`ladder`) chooses (`climbing`). Bounds are imposed on the knots that were
+chosen, and may send them back to coarser ones.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,10 +14,11 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from wallmirror.derendering.bounds import Bound, cramer_rao
-from wallmirror.derendering.estimate import scale_free_error
-from wallmirror.derendering.finer import Films, Finer, score, worth
-from wallmirror.derendering.ladder import ROUGH, Ladder
+from wallmirror.derendering.bounds import Bound, bound_of
+from wallmirror.derendering.climbing import Other, Tell, climb
+from wallmirror.derendering.groups import Groups
+from wallmirror.derendering.information import Information, information
+from wallmirror.derendering.ladder import Ladder
 from wallmirror.derendering.likelihood import Fit, maximise
 from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.problem import Problem, expected_mismatch, too_few_patterns
@@ -27,24 +27,16 @@ from wallmirror.derendering.subspace import ClosedForm, SignalSpace
 from wallmirror.errors import UndeterminedError
 
 Array = NDArray[np.float64]
-Tell = Callable[[str], None]
 
 #: Knot spacings in degrees, each half of the one before.
 NOISY_STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
-# Share of a tolerance below which a move of the pattern is none.
-_SETTLED = 0.25
 # A mismatch in units of what noise makes of it, beyond which knots are too coarse to be fitted; the share of it below
-# which the gap says that they are too fine; and the closed form's own error up to which it is a start.
+# which the gap says that they are too fine; the share of it that finer knots leave if it is not for the knots; and the closed
+# form's own error up to which it is a start.
 _FAR_OFF = 2.0
+_ALIKE = 0.9
 _GAP = 1.0
-_START = 0.3
-# Share of the data that finer knots must leave over.
-_SPARE = 0.25
-# Share of the BRDF's largest coefficient above which one is lit, of the best-seen one's information above which that one
-# counts, and of lit coefficients up to which rho is sparse.
-_LIT = 0.01
-_WELL_SEEN = 1e-3
-_SPARSE = 0.5
+_START = 1.0
 
 
 @dataclass(frozen=True)
@@ -55,6 +47,8 @@ class Level:
     ----------
     free, fit:
         The maxima of the likelihood without bounds and with those that were asked for.
+    groups:
+        Of elements that share no coefficient; the fit has each in a scale of its own.
     """
 
     grid: SplineGrid
@@ -63,6 +57,7 @@ class Level:
     closed: ClosedForm
     free: Fit
     fit: Fit
+    groups: Groups
 
     @property
     def parameters(self) -> int:
@@ -75,21 +70,25 @@ class Level:
         return self.grid.peak(self.fit.coefficients, self.summed.exposure)
 
     @cached_property
+    def information(self) -> Information:
+        """The Fisher information at the fit, in units of the weights."""
+        return information(self.summed, self.fit.coefficients, self.fit.source, self.fit.schur)
+
+    @cached_property
     def bound(self) -> Bound:
         """The Cramer-Rao bound at the fit, for noise of unit variance in units of the weights."""
-        return self.bound_at(self.fit.source)
+        return self._bound_of(self.information, self.fit.source)
 
     def bound_at(self, source: Array) -> Bound:
         """The bound at the fit's rho and another V, shape (M, B)."""
-        return cramer_rao(self.summed, self.fit.coefficients, source, gauge=self.grid.row(self.peak_at))
+        return self._bound_of(information(self.summed, self.fit.coefficients, source), source)
 
-
-@dataclass(frozen=True)
-class Other:
-    """Pattern (M, B) and misfit on knots beside the chosen ones."""
-
-    source: Array
-    objective: float
+    def _bound_of(self, known: Information, source: Array) -> Bound:
+        if len(self.groups) == 1:
+            gauge = self.grid.row(self.peak_at)
+            return bound_of(known, coefficients=self.fit.coefficients, source=source, gauge=gauge)
+        gauges = self.groups.gauges(self.grid, self.fit.coefficients, self.summed.exposure)
+        return bound_of(known, coefficients=self.fit.coefficients, source=source, gauge=gauges, groups=self.groups)
 
 
 @dataclass(frozen=True)
@@ -128,7 +127,7 @@ def refine(
     begin = _first_worth_a_fit(ladder)
     while True:
         try:
-            fits, rival = _climb(ladder, begin, nonnegative, tolerance, tell)
+            fits, rival = climb(ladder, begin, nonnegative, tolerance, tell)
         except UndeterminedError:
             if begin == 0 and space.rank < problem.card.elements:
                 raise too_few_patterns(space.rank, problem.card.elements) from None
@@ -149,6 +148,8 @@ def refine(
         if begin == 0:
             break
         begin -= 1
+    if space.rank < problem.card.elements:
+        raise too_few_patterns(space.rank, problem.card.elements)
     raise UndeterminedError(
         "the captures leave the pattern undetermined on the coarsest knots already; capture more light, views or patterns"
     )
@@ -158,19 +159,24 @@ def _level(ladder: Ladder, index: int, free: Fit, nonnegative: bool) -> Level | 
     """The fit within the bounds asked for, or None where its error bars say that nothing determines it."""
     summed = ladder.summed(index)
     fit = ladder.bounded(index, free) if nonnegative else maximise(summed, free.coefficients, nonnegative=False)
-    level = Level(ladder.grids[index], ladder.designs(index), summed, ladder.closed(index), free, fit)
+    grid, groups = ladder.grids[index], ladder.groups(index)
+    if len(groups) > 1:
+        fit = groups.scaled(fit, grid, summed.exposure)
+    level = Level(grid, ladder.designs(index), summed, ladder.closed(index), free, fit, groups)
     return level if math.isfinite(level.bound.source_error) else None
 
 
 def _first_worth_a_fit(ladder: Ladder) -> int:
     """Index of knots whose closed form misses the data's space by about what noise makes it miss, and is a start.
 
-    Coarser ones are far from explaining the films, and a fit on them would only be a start for the next. Where none
-    comes near, or the noise is not known, the search begins with the coarsest.
+    Coarser ones are far from explaining the films, and a fit on them would only be a start for the next. Where finer ones
+    miss as much, it is not for the knots; where none comes near, or the noise is not known, the search begins with the
+    coarsest.
     """
     if ladder.space.rank < ladder.problem.card.elements:
         return 0
     index = max(0, ladder.last - 2)
+    ladder.summed(index)  # which nearly every search asks for, and of which the closed form makes use
     closed = ladder.closed(index)
     expected = expected_mismatch(ladder.problem, ladder.space, closed)
     if math.isnan(expected):
@@ -180,123 +186,9 @@ def _first_worth_a_fit(ladder: Ladder) -> int:
     for finer in range(index + 1, ladder.last + 1):
         if closed.gap < _GAP * closed.mismatch:
             break
-        closed = ladder.closed(finer)
+        coarser, closed = closed, ladder.closed(finer)
         if not closed.mismatch > _FAR_OFF * expected_mismatch(ladder.problem, ladder.space, closed):
             return finer
+        if closed.mismatch > _ALIKE * coarser.mismatch:
+            return finer - 1 if coarser.error < _START else 0
     return 0
-
-
-def _climb(
-    ladder: Ladder, begin: int, nonnegative: bool, tolerance: float | None, tell: Tell
-) -> tuple[dict[int, Fit], Other | None]:
-    """The free fits on the knots taken, by index, and what finer ones that were not would make of the last."""
-
-    def fit(index: int, *starts: Array) -> Fit:
-        found = maximise(ladder.summed(index), *starts, nonnegative=False, tolerance=ROUGH)
-        tell(f"knots every {math.degrees(ladder.grids[index].step):g} deg: misfit {found.objective:.6g}")
-        return found
-
-    index = begin
-    best = fit(index, ladder.closed(index).coefficients)
-    rival: Other | None = None
-    while index > 0:  # coarser ones may do
-        coarser = fit(index - 1, ladder.coarsened(index, best.coefficients))
-        freedom = ladder.freedom(index)
-        fewer = ladder.seen(index) - ladder.seen(index - 1)
-        if coarser.objective - best.objective >= worth(fewer, freedom) * ladder.variance(best.objective, freedom):
-            break
-        rival = Other(best.source, best.objective)
-        index, best = index - 1, coarser
-    fits = {index: best}
-    if rival is not None:
-        return fits, rival
-    idle = 0
-    for finer in range(index + 1, ladder.last + 1):
-        if ladder.spare(finer) < _SPARE:
-            break  # nearly as many coefficients as data follow whatever the model misses
-        try:
-            trial, other = _finer(ladder, index, best, finer, nonnegative, fit, tell)
-        except UndeterminedError:
-            break  # so fine a grid has cells that nothing determines
-        if trial is not None:
-            moved = scale_free_error(best.source, trial.source)
-            index, best, rival, idle = finer, trial, None, 0
-            fits[index] = best
-            if tolerance is not None and _at_the_noise(ladder, index, best) and moved <= _SETTLED * tolerance:
-                tell(f"the pattern moved by {moved:.1e} only: knots are fine enough for {tolerance:g}")
-                break
-            continue
-        rival = rival or other
-        # One idle halving ends the search, unless the noise is known and not yet reached.
-        idle += 1
-        if idle == 2 or not ladder.problem.noise_is_stated or _at_the_noise(ladder, index, best):
-            break
-    return fits, rival
-
-
-def _at_the_noise(ladder: Ladder, index: int, fit: Fit) -> bool:
-    """Whether the misfit is what the stated noise makes."""
-    observations = ladder.summed(index).observations
-    return ladder.problem.noise_is_stated and fit.objective < observations + 4 * math.sqrt(2 * observations)
-
-
-def _finer(
-    ladder: Ladder, index: int, best: Fit, finer: int, nonnegative: bool, fit: Callable[..., Fit], tell: Tell
-) -> tuple[Fit | None, Other]:
-    """The fit on finer knots if these pay, and what they would make of the best one so far.
-
-    Where rho >= 0 leaves most of the angles dark, it is enough if finer knots pay in the lit ones, where their error lies.
-    """
-    start = ladder.refined(index, best.coefficients, finer)
-    if finer < ladder.last - 1:  # coarse still: to try is no dearer than to tell
-        return _paying(ladder, index, best, finer, fit(finer, start))
-    every = np.ones(start.size, dtype=bool)
-    found, price = _tested(ladder, index, best, finer, every, ladder.seen(index), tell)
-    if found.gain >= price:
-        return _paying(ladder, index, best, finer, fit(finer, start + found.step, start))
-    if nonnegative:
-        within = ladder.bounded(index, best)
-        lit = within.coefficients > _LIT * float(
-            np.max(within.coefficients[ladder.summed(index).exposure > _WELL_SEEN])
-        )
-        free = ladder.refined(index, lit.astype(np.float64), finer) > 0
-        if np.count_nonzero(free) < _SPARSE * free.size:
-            of_lit, its_price = _tested(ladder, index, within, finer, free, int(np.count_nonzero(lit)), tell)
-            if of_lit.gain >= its_price:
-                trial = fit(finer, start + found.step, start)
-                return trial, Other(trial.source, trial.objective)
-    return None, _stepped(ladder, finer, start + found.step)
-
-
-def _paying(ladder: Ladder, index: int, best: Fit, finer: int, trial: Fit) -> tuple[Fit | None, Other]:
-    """The fit on finer knots if it explains more than noise would let it."""
-    freedom = ladder.freedom(finer)
-    price = worth(ladder.seen(finer) - ladder.seen(index), freedom) * ladder.variance(trial.objective, freedom)
-    return (trial if best.objective - trial.objective >= price else None), Other(trial.source, trial.objective)
-
-
-def _tested(
-    ladder: Ladder, index: int, fit: Fit, finer: int, free: NDArray[np.bool_], used: int, tell: Tell
-) -> tuple[Finer, float]:
-    """What finer knots gain and what they must, for coefficients that are free to move where `used` of the coarser were."""
-    problem = ladder.problem
-    transport = np.stack([t @ fit.coefficients for t in ladder.designs(index)], axis=1)
-    films = Films(problem.data, problem.fit_weights, transport, fit.source)
-    freedom = ladder.freedom(index) - used
-    enough = worth(int(np.count_nonzero(free)), freedom) * ladder.variance(fit.objective, freedom)
-    found = score(films, ladder.designs(finer), ladder.band(finer), free, enough=enough)
-    price = worth(max(1, found.free - used), freedom) * ladder.variance(fit.objective - found.gain, freedom)
-    tell(
-        f"knots every {math.degrees(ladder.grids[finer].step):g} deg would lower it by {found.gain:.4g}"
-        + ("" if np.all(free) else f" with {found.free} lit coefficients")
-        + f", noise by up to {price:.4g}"
-    )
-    return found, price
-
-
-def _stepped(ladder: Ladder, index: int, r: Array) -> Other:
-    """Pattern and misfit at given coefficients, without a fit."""
-    transport = np.stack([t @ r for t in ladder.designs(index)], axis=1)
-    films = Films(ladder.problem.data, ladder.problem.fit_weights, transport, np.zeros((transport.shape[1], 1)))
-    source = films.solved(films.data)
-    return Other(source, Films(films.data, films.weights, transport, source).objective())

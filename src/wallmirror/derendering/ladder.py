@@ -1,13 +1,12 @@
 """Nested spline grids for the BRDF of one problem, with what a fit needs of the data on each, made when first asked for.
 
-Every grid halves the knot spacing of the one before, so that the splines of each lie among those of the next, and what a
-fit needs of the data on coarse knots follows from what it needs on finer ones without another pass over the pixels.
+Every grid halves the knot spacing of the one before, so that the splines of each lie among those of the next.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,16 +14,18 @@ import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
 
 from wallmirror.derendering.finer import worth
+from wallmirror.derendering.groups import Groups, closed_form_in_groups, groups_of
 from wallmirror.derendering.likelihood import Fit, best_nonnegative, maximise
 from wallmirror.derendering.moments import Moments, moments
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import SplineGrid, design_matrices
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, banded_gram, closed_form
+from wallmirror.transport import Kernel
 
 Array = NDArray[np.float64]
 
 #: Between knots the fits need not be finer than this share of the misfit.
-ROUGH = 1e-6
+ROUGH = 1e-5
 # That of the closed form: splines of degree 3 need knots half as far apart for lobes of the same width.
 _DEGREE = 7
 # Quadrature of the fit, of a lobe's peak.
@@ -45,6 +46,7 @@ class Ladder:
     space: SignalSpace
     grids: tuple[SplineGrid, ...]
     quadrature: float
+    _kernels: dict[int, Kernel] = field(default_factory=dict)
     _designs: dict[int, list[sp.csr_array]] = field(default_factory=dict)
     _summed: dict[int, Moments] = field(default_factory=dict)
     _bands: dict[int, Array] = field(default_factory=dict)
@@ -56,7 +58,8 @@ class Ladder:
     def of(cls, problem: Problem, space: SignalSpace, steps: tuple[float, ...], tolerance: float | None) -> Ladder:
         """Over the angle sums of a problem; one spacing in degrees, or several, each half of the one before."""
         quadrature = _quadrature(problem, tolerance)
-        u = problem.kernel(steps[-1], quadrature).angle_sum
+        finest = problem.kernel(steps[-1], quadrature)
+        u = finest.angle_sum
         room = math.radians(steps[-1]) if len(steps) > 1 else 0.0  # other quadratures reach a little further
         grids = [
             SplineGrid.covering(
@@ -65,7 +68,7 @@ class Ladder:
         ]
         for _ in steps[1:]:
             grids.append(grids[-1].halved())
-        return cls(problem, space, tuple(grids), quadrature)
+        return cls(problem, space, tuple(grids), quadrature, {len(steps) - 1: finest})
 
     @property
     def last(self) -> int:
@@ -75,33 +78,45 @@ class Ladder:
     def designs(self, index: int) -> list[sp.csr_array]:
         """T_1 .. T_M, each sparse (P, K)."""
         if index not in self._designs:
-            grid = self.grids[index]
-            kernel = self.problem.kernel(math.degrees(grid.step), self.quadrature)
-            self._designs[index] = design_matrices(kernel, grid)
+            # One quadrature for all knots but the finest, so that their misfits differ for the knots' sake alone.
+            finer = max(index, self.last - 1)
+            if finer not in self._kernels:
+                self._kernels[finer] = self.problem.kernel(math.degrees(self.grids[finer].step), self.quadrature)
+            self._designs[index] = design_matrices(self._kernels[finer], self.grids[index])
         return self._designs[index]
 
     def summed(self, index: int) -> Moments:
-        """Of the two finest from the pixels, of the others from the next finer one."""
+        """What the likelihood needs of the data."""
         if index not in self._summed:
-            if index < self.last - 1:
-                made = self.summed(index + 1).coarsened(self.grids[index].in_halved())
-            else:
-                made = moments(self.problem.data, self.designs(index), self.problem.inverse_variance)
-            self._summed[index] = made
+            made, groups = (
+                moments(self.problem.data, self.designs(index), self.problem.inverse_variance),
+                self.groups(index),
+            )
+            self._summed[index] = replace(made, apart=groups.cells) if len(groups) > 1 else made
         return self._summed[index]
 
     def closed(self, index: int) -> ClosedForm:
         """The closed form."""
         if index not in self._closed:
-            weighted = self.problem.weighted(self.designs(index))
-            band = self.band(index)
-            self._closed[index] = closed_form(self.problem.weighted_data, weighted, self.space, band=band)
+            weighted, groups = self.problem.weighted(self.designs(index)), self.groups(index)
+            if len(groups) > 1:
+                made = closed_form_in_groups(self.problem.weighted_data, weighted, self.space, groups)
+            else:
+                made = closed_form(self.problem.weighted_data, weighted, self.space, band=self.band(index))
+            self._closed[index] = made
         return self._closed[index]
+
+    def groups(self, index: int) -> Groups:
+        """The elements that share coefficients on these knots."""
+        return groups_of(self.designs(index))
 
     def band(self, index: int) -> Array:
         """Lower band of sum_i T_i^T W T_i."""
         if index not in self._bands:
-            self._bands[index] = banded_gram(self.problem.weighted(self.designs(index)))
+            if index in self._summed and self.problem.fit_weights.shape[1] == 1:
+                self._bands[index] = self._summed[index].pairs[0].band
+            else:
+                self._bands[index] = banded_gram(self.problem.weighted(self.designs(index)))
         return self._bands[index]
 
     def bounded(self, index: int, free: Fit) -> Fit:

@@ -8,7 +8,7 @@ eliminates V (variable projection; Golub and Pereyra, SIAM J. Numer. Anal. 10(2)
     S = sum_b J_b^T W J_b - C_b^T H_b^-1 C_b,
     S dr = sum_b J_b^T W e_b - C_b^T H_b^-1 F^T W e_b,      dv_b = H_b^-1 (F^T W e_b - C_b dr).
 
-S is also the Fisher information of r with V eliminated; its null vector is r itself, the global scale.
+S is also the Fisher information of r with V eliminated (`information`); its null vector is r itself, the global scale.
 Non-negativity turns each step into a convex quadratic programme, solved by block pivoting (`convex`).
 """
 
@@ -17,18 +17,27 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg as sl
 from numpy.typing import NDArray
 
-from wallmirror.derendering.convex import minimise_above, solve_positive
+from wallmirror.derendering.convex import minimise_above, positive_factor
+from wallmirror.derendering.information import Point, inverses, mixed, point_at, schur_complement
 from wallmirror.derendering.moments import Moments, moments
+from wallmirror.errors import UndeterminedError
 
-__all__ = ["Fit", "Moments", "best_nonnegative", "information", "maximise", "moments"]
+__all__ = ["Fit", "Moments", "best_nonnegative", "maximise", "moments"]
 
 Array = NDArray[np.float64]
 
 # Cells seen less than this relative to the best-seen one are weak: noise rules them in a start.
 _WEAK = 1e-4
 _RIDGE = 1e-12
+# S is made anew where a step with that of the point before promises more than this share of what the last one did, or so
+# little, as a share of what ends the climb, that the climb seems to be over.
+_QUICK = 0.1
+_SURE = 0.01
+# Condition of H beyond which S, that C^T H^-1 C is taken from, keeps too few of its digits for a step without bounds.
+_LOST = 1e10
 
 
 @dataclass(frozen=True)
@@ -47,6 +56,8 @@ class Fit:
         Newton steps taken.
     converged:
         Whether the last step was below the tolerance.
+    schur:
+        S at the maximum, over the seen coefficients, where it is at hand.
     """
 
     coefficients: Array
@@ -54,15 +65,32 @@ class Fit:
     objective: float
     iterations: int
     converged: bool
+    schur: Array | None = None
 
 
 @dataclass(frozen=True)
-class _State:
-    r: Array
-    v: Array  # (B, M)
-    normal: Array  # H, (G, M, M)
-    pair: Array  # N_ij r, (G, M, M, K)
-    objective: float
+class _Curvature:
+    """What a Gauss-Newton step takes from the point where it starts, or from one nearby.
+
+    Parameters
+    ----------
+    free:
+        Entries of V that may move, (B, M).
+    inverse:
+        H_b^-1, (B, M, M).
+    schur:
+        S over the seen coefficients.
+    pinned:
+        S with the gauge; None where nothing depends on r.
+    factor:
+        The Cholesky factor of that, as `positive_factor` makes it, where r has no bounds.
+    """
+
+    free: NDArray[np.bool_]
+    inverse: Array
+    schur: Array
+    pinned: Array | None
+    factor: Array | None
 
 
 def maximise(
@@ -82,19 +110,28 @@ def maximise(
         Keep r >= 0 and V >= 0.
     tolerance:
         Stop when a full step promises to change the objective by less than this share.
+
+    Raises
+    ------
+    UndeterminedError
+        When the information is singular to rounding: nothing determines r, or V for an r that the climb comes through.
     """
     seen = data.seen
     begins = (np.where(seen, _clipped(data, r) if nonnegative else r, 0.0) for r in starts)
-    states = (_evaluate(data, r, None, nonnegative=nonnegative) for r in begins)
+    states = (point_at(data, r, nonnegative=nonnegative) for r in begins)
     state = min(states, key=lambda candidate: candidate.objective)
     rounding = 1e-14 * float(np.sum(data.energy))
+    curvature: _Curvature | None = None
+    slope = 0.0
     for iteration in range(1, max_iterations + 1):
-        dr, slope = _step(data, state, seen, nonnegative=nonnegative)
-        if slope <= tolerance * state.objective + rounding:
-            return _fit(state, iteration, converged=True)
+        enough = tolerance * state.objective + rounding
+        last, between = curvature, (_SURE * enough, _QUICK * slope)
+        dr, slope, curvature = _step(data, state, seen, last, between, nonnegative=nonnegative)
+        if slope <= enough and curvature is not last:
+            return _fit(state, iteration, converged=True, curvature=curvature)
         length = 1.0
         while True:
-            trial = _evaluate(data, state.r + length * dr, None, nonnegative=nonnegative)
+            trial = point_at(data, state.r + length * dr, nonnegative=nonnegative)
             if trial.objective <= state.objective - 1e-4 * length * slope:
                 break
             length /= 2
@@ -102,19 +139,6 @@ def maximise(
                 return _fit(state, iteration, converged=slope <= 1e-6 * state.objective + 1e3 * rounding)
         state = trial
     return _fit(state, max_iterations, converged=False)
-
-
-def information(data: Moments, coefficients: Array, source: Array) -> tuple[Array, Array, Array]:
-    """Fisher information in units of the weights: S over the seen cells, H_b^-1 and H_b^-1 C_b.
-
-    Returns
-    -------
-    S of shape (K', K') for the K' seen coefficients, H_b^-1 (B, M, M), H_b^-1 C_b (B, M, K').
-    """
-    seen = data.seen
-    state = _evaluate(data, coefficients, source.T, nonnegative=True)
-    gram, inverse, coupled = _schur(data, state, np.ones_like(state.v, dtype=bool), np.flatnonzero(seen))
-    return gram, inverse, coupled
 
 
 def best_nonnegative(data: Moments, source: Array) -> Array:
@@ -134,94 +158,65 @@ def _clipped(data: Moments, r: Array) -> Array:
     return np.clip(r, 0.0, np.where(weak, np.max(r[~weak], initial=0.0), np.inf))
 
 
-def _fit(state: _State, iterations: int, *, converged: bool) -> Fit:
-    return Fit(state.r, state.v.T.copy(), state.objective, iterations, converged)
+def _fit(state: Point, iterations: int, *, converged: bool, curvature: _Curvature | None = None) -> Fit:
+    # With entries of V at their bounds the curvature counts these as known, which the information does not.
+    schur = curvature.schur if curvature is not None and np.all(curvature.free) else None
+    return Fit(state.r, state.v.T.copy(), state.objective, iterations, converged, schur)
 
 
-def _evaluate(data: Moments, r: Array, v: Array | None, *, nonnegative: bool) -> _State:
-    m = data.elements
-    pair = np.stack([pairs.times(r) for pairs in data.pairs])
-    normal = pair @ r
-    moment = data.cross @ r  # (B, M)
-    if v is None:
-        level = 1e-14 * np.trace(normal, axis1=1, axis2=2) + 1e-290  # an rho of 0 gives V = 0
-        ridge = level[:, None, None] * np.eye(m)
-        v = np.linalg.solve((normal + ridge)[data.group], moment[..., None])[..., 0]
-        if nonnegative:
-            for b in np.flatnonzero(np.any(v < 0, axis=1)):
-                quadratic_b = normal[data.group[b]] + ridge[data.group[b]]
-                v[b] = minimise_above(np.zeros(m), quadratic_b, moment[b])
-    quadratic = np.einsum("bi,bij,bj->b", v, normal[data.group], v)
-    objective = float(np.sum(data.energy - 2 * np.sum(v * moment, axis=1) + quadratic))
-    return _State(r, v, normal, pair, objective)
+def _step(
+    data: Moments,
+    state: Point,
+    seen: NDArray[np.bool_],
+    last: _Curvature | None,
+    between: tuple[float, float],
+    *,
+    nonnegative: bool,
+) -> tuple[Array, float, _Curvature]:
+    """The Gauss-Newton step in r with V eliminated, the decrease of the objective that it promises, and its curvature.
 
-
-def _step(data: Moments, state: _State, seen: NDArray[np.bool_], *, nonnegative: bool) -> tuple[Array, float]:
-    """The Gauss-Newton step in r with V eliminated, and the decrease of the objective that it promises."""
-    residual = data.cross - _modelled(data, state)  # T_i^T W e_b
-    grad_r = np.einsum("bi,bik->k", state.v, residual)
-    grad_v = residual @ state.r
-    free_v = np.ones_like(state.v, dtype=bool)
-    if nonnegative:
-        free_v = (state.v > 0) | (grad_v > 0)
+    Near the maximum the curvature hardly changes: the last step's does for promises `between` two values. Whether the climb
+    is over, only the curvature of the place itself may say.
+    """
+    grad_v = state.moment - np.einsum("bij,bj->bi", state.normal[data.group], state.v)
+    grad_r = np.einsum("bi,bik->k", state.v, data.cross) - mixed(data, state, state.v)
+    free = (state.v > 0) | (grad_v > 0) if nonnegative else np.ones_like(state.v, dtype=bool)
+    grad_v = np.where(free, grad_v, 0.0)
     cells = np.flatnonzero(seen)
-    grad_v = np.where(free_v, grad_v, 0.0)
-    schur, _, coupled = _schur(data, state, free_v, cells)
-    right = grad_r[cells] - np.einsum("bmk,bm->k", coupled, grad_v)
+
+    def along(curvature: _Curvature) -> tuple[Array, float, _Curvature]:
+        eliminated = np.einsum("bij,bj->bi", curvature.inverse, grad_v)
+        right = (grad_r - mixed(data, state, eliminated))[cells]
+        dr = np.zeros_like(state.r)
+        if nonnegative and curvature.pinned is not None:
+            dr[cells] = minimise_above(-state.r[cells], curvature.pinned, right)
+        elif curvature.factor is not None:
+            dr[cells] = sl.cho_solve((curvature.factor, True), right, check_finite=False)
+        return dr, float(grad_r @ dr), curvature
+
+    if last is not None and np.array_equal(free, last.free):
+        found = along(last)
+        if between[0] < found[1] <= between[1]:
+            return found
+    return along(_curvature(data, state, free, cells, nonnegative=nonnegative))
+
+
+def _curvature(
+    data: Moments, state: Point, free: NDArray[np.bool_], cells: NDArray[np.intp], *, nonnegative: bool
+) -> _Curvature:
+    if not nonnegative and np.max(np.linalg.cond(state.normal)) > _LOST:
+        raise UndeterminedError(
+            "the captures do not tell the card's elements apart; capture more light, views or patterns"
+        )
+    inverse = inverses(data, state, free)
+    schur = schur_complement(data, state, free, inverse, cells)
     r = state.r[cells]
     level = np.trace(schur) / max(1, cells.size)
-    step = np.zeros(cells.size)
-    if level > 0:
-        # The gauge r r^T keeps the step off the scale's null direction; the ridge is for barely seen cells.
-        schur += level * np.outer(r, r) / max(float(r @ r), 1e-300)
-        schur[np.diag_indices_from(schur)] += _RIDGE * level
-        step = minimise_above(-r, schur, right) if nonnegative else solve_positive(schur, right)
-    dr = np.zeros_like(state.r)
-    dr[cells] = step
-    return dr, float(grad_r @ dr)
-
-
-def _modelled(data: Moments, state: _State) -> Array:
-    """T_i^T W F v_b, shape (B, M, K)."""
-    b, m = state.v.shape
-    total = np.empty((b, m, data.size))
-    for g, pair in enumerate(state.pair):
-        rows = np.flatnonzero(data.group == g)
-        # sum_j v_j (T_i^T W T_j r): one product of matrices a group.
-        product = state.v[rows] @ pair.transpose(1, 0, 2).reshape(m, -1)
-        total[rows] = product.reshape(rows.size, m, data.size)
-    return total
-
-
-def _schur(
-    data: Moments, state: _State, free: NDArray[np.bool_], cells: NDArray[np.intp]
-) -> tuple[Array, Array, Array]:
-    """S on the given cells, and H_b^-1, H_b^-1 C_b with the rows of fixed source entries zero."""
-    m = data.elements
-    total = data.gram_of_source(state.v)
-    normal = state.normal[data.group].copy()
-    both = free[:, :, None] & free[:, None, :]
-    normal = np.where(both, normal, np.eye(m) * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-300)
-    ridge = 1e-14 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(m)
-    inverse = np.where(both, np.linalg.inv(normal + ridge), 0.0)
-    coupling = _coupling(data, state)[..., cells]
-    coupled = inverse @ coupling
-    schur = total if cells.size == data.size else total[np.ix_(cells, cells)]
-    if len(data.pairs) == 1 and np.all(free) and state.v.shape[0] > m:
-        # One H for all: sum_b C_b^T H^-1 C_b hangs on V V^T alone, so that M columns do for B.
-        few = np.linalg.qr(state.v, mode="r") @ state.pair[0].reshape(m, -1)
-        coupling = few.reshape(m, m, data.size)[..., cells]
-        schur -= coupling.reshape(-1, cells.size).T @ (inverse[0] @ coupling).reshape(-1, cells.size)
-    else:
-        schur -= coupling.reshape(-1, cells.size).T @ coupled.reshape(-1, cells.size)
-    return 0.5 * (schur + schur.T), inverse, coupled
-
-
-def _coupling(data: Moments, state: _State) -> Array:
-    """C_b[i] = sum_j v_j (T_j^T W T_i r), shape (B, M, K)."""
-    b, m = state.v.shape
-    total = np.empty((b, m, data.size))
-    for g, pair in enumerate(state.pair):
-        rows = np.flatnonzero(data.group == g)
-        total[rows] = (state.v[rows] @ pair.reshape(m, -1)).reshape(rows.size, m, data.size)
-    return total
+    if not level > 0:
+        return _Curvature(free, inverse, schur, None, None)
+    # The gauge r r^T keeps the step off the null direction of each scale; the ridge is for barely seen cells.
+    null = r[None] if data.apart is None else np.where(data.apart[:, cells], r, 0.0)
+    null = null / np.maximum(np.linalg.norm(null, axis=1, keepdims=True), 1e-150)
+    pinned = schur + level * null.T @ null
+    pinned[np.diag_indices_from(pinned)] += _RIDGE * level
+    return _Curvature(free, inverse, schur, pinned, None if nonnegative else positive_factor(pinned))

@@ -9,13 +9,15 @@ so that an iteration of a fit does not touch the pixels.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+
+from wallmirror.derendering.windows import Windows
+from wallmirror.memory import pairs_bytes, require_memory
 
 Array = NDArray[np.float64]
 
@@ -29,46 +31,86 @@ class Pairs:
 
     Parameters
     ----------
-    stacked:
-        N_ij for every i and j one below the other, (i, j) = (0, 0), (0, 1), ..., csr (M M K, K).
-    where, values, counts:
-        Entries of N_ij for i <= j, (0, 0), (0, 1), (1, 1), (0, 2), ...: their place in a flat (K, K), their value (halved
-        for i = j), and how many each pair has.
-    diagonal:
-        Diagonal of sum_i N_ii, shape (K,).
+    above:
+        N_ij for i <= j, (i, j) = (0, 0), (0, 1), ..., (0, M - 1), (1, 1), ..., along the diagonal of one csr matrix. N_ji
+        is the transpose.
+    elements:
+        M.
     """
 
-    stacked: sp.csr_array
-    where: NDArray[np.int64]
-    values: Array
-    counts: NDArray[np.intp]
-    diagonal: Array
+    above: sp.csr_array
+    elements: int
+
+    @classmethod
+    def of(cls, designs: list[sp.csr_array], windows: Windows | None, weight: Array) -> Pairs:
+        """From T_1 .. T_M, cut into windows where that can be, and w of shape (P,)."""
+        elements, size = len(designs), designs[0].shape[1]
+        if windows is not None:
+            entries, columns, values = windows.grams(weight)
+        else:
+            entries, columns, values = _sparse_grams(designs, weight)
+        first = np.repeat(np.arange(0, entries.size, size), entries.reshape(-1, size).sum(axis=1))
+        pointers = np.concatenate([[0], np.cumsum(entries)])
+        above = sp.csr_array((values, columns + first, pointers), shape=(entries.size, entries.size))
+        return cls(above, elements)
+
+    @property
+    def size(self) -> int:
+        """K."""
+        return int(self.above.shape[0]) // (self.elements * (self.elements + 1) // 2)
+
+    @cached_property
+    def _below(self) -> sp.csc_array:
+        """The same matrix the other way round."""
+        return self.above.T
+
+    @cached_property
+    def _of(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """The i and the j of each pair."""
+        return np.triu_indices(self.elements)
+
+    @cached_property
+    def _where(self) -> NDArray[np.int64]:
+        """Place of each entry in a flat (K, K)."""
+        size = self.size
+        row = np.tile(np.arange(0, size * size, size), self.above.shape[0] // size)
+        return np.asarray(np.repeat(row, np.diff(self.above.indptr)) + self.above.indices % size)
+
+    @cached_property
+    def _counts(self) -> NDArray[np.int64]:
+        """Entries of each pair."""
+        return np.asarray(np.diff(self.above.indptr[:: self.size]))
+
+    @cached_property
+    def band(self) -> Array:
+        """Lower band of sum_i N_ii, shape (w, K): entry [d, k] is that of row k + d and column k."""
+        size = self.size
+        pointers = self.above.indptr.astype(np.intp)
+        first = [i * self.elements - i * (i - 1) // 2 for i in range(self.elements)]  # (i, i) among the pairs
+        inside = np.concatenate([np.arange(pointers[k * size], pointers[(k + 1) * size]) for k in first])
+        row, column = np.divmod(self._where[inside], size)
+        below = row >= column
+        place = (row - column)[below] * size + column[below]
+        width = int(np.max(row - column, initial=0)) + 1
+        sums = np.bincount(place, weights=self.above.data[inside[below]], minlength=width * size)
+        return np.asarray(sums.reshape(width, size), dtype=np.float64)
 
     def times(self, r: Array) -> Array:
         """N_ij r, shape (M, M, K)."""
-        elements = math.isqrt(self.stacked.shape[0] // r.size)
-        return np.asarray((self.stacked @ r).reshape(elements, elements, r.size))
-
-    def coarsened(self, prolongation: sp.csr_array) -> Pairs:
-        """R^T N_ij R: the same of coefficients that are R times coarser ones, R of shape (K, K')."""
-        size, coarse = prolongation.shape
-        elements = math.isqrt(self.stacked.shape[0] // size)
-        columns = sp.csr_array(self.stacked @ prolongation)
-        down = sp.csr_array(prolongation.T)
-        blocks = {}
-        for j in range(elements):
-            for i in range(j + 1):
-                k = (i * elements + j) * size
-                blocks[i, j] = sp.csr_array(down @ columns[k : k + size])
-        return _laid_out(blocks, elements, coarse)
+        i, j = self._of
+        every = np.tile(r, i.size)
+        products = np.empty((self.elements, self.elements, r.size))
+        products[i, j] = (self.above @ every).reshape(i.size, -1)
+        products[j, i] = (self._below @ every).reshape(i.size, -1)
+        return products
 
     def mixed(self, products: Array) -> Array:
         """sum_ij products_ij N_ij for symmetric products (M, M), dense (K, K)."""
-        size = self.stacked.shape[1]
-        factors = np.concatenate([products[: j + 1, j] for j in range(products.shape[0])])
-        half = np.bincount(self.where, weights=self.values * np.repeat(factors, self.counts), minlength=size * size)
-        square = np.asarray(half, dtype=np.float64).reshape(size, size)
-        return square + square.T
+        size = self.size
+        factors = (products - 0.5 * np.diag(np.diag(products)))[self._of]
+        weights = self.above.data * np.repeat(factors, self._counts)
+        square = np.bincount(self._where, weights=weights, minlength=size * size).reshape(size, size)
+        return np.asarray(square + square.T, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -87,6 +129,8 @@ class Moments:
         sum_p w d^2 of each realisation, shape (B,).
     observations:
         Number of data with weight > 0.
+    apart:
+        Which coefficients belong to each of several groups that have a scale each, shape (G, K); None for one scale.
     """
 
     pairs: list[Pairs]
@@ -94,6 +138,7 @@ class Moments:
     cross: Array
     energy: Array
     observations: int
+    apart: NDArray[np.bool_] | None = None
 
     @property
     def elements(self) -> int:
@@ -108,7 +153,7 @@ class Moments:
     @cached_property
     def exposure(self) -> Array:
         """How well each coefficient is seen, relative to the best-seen one, shape (K,)."""
-        total = np.sum([pairs.diagonal for pairs in self.pairs], axis=0)
+        total = np.sum([pairs.band[0] for pairs in self.pairs], axis=0)
         return np.asarray(total / max(float(total.max(initial=0.0)), 1e-300))
 
     @property
@@ -123,12 +168,6 @@ class Moments:
             rows = v[self.group == g]
             total += pairs.mixed(rows.T @ rows)
         return total
-
-    def coarsened(self, prolongation: sp.csr_array) -> Moments:
-        """The moments of coefficients r' with r = R r', for R of shape (K, K'): no pass over the data is needed."""
-        realisations, elements, size = self.cross.shape
-        cross = (self.cross.reshape(-1, size) @ prolongation).reshape(realisations, elements, -1)
-        return replace(self, pairs=[pairs.coarsened(prolongation) for pairs in self.pairs], cross=cross)
 
 
 def moments(data: Array, designs: list[sp.csr_array], inverse_variance: Array | None = None) -> Moments:
@@ -147,8 +186,14 @@ def moments(data: Array, designs: list[sp.csr_array], inverse_variance: Array | 
     full = np.broadcast_to(weights, data.shape) if weights.shape[1] == 1 else weights[:, group]
     weighted = full * data
     cross = np.stack([(t.T @ weighted).T for t in designs], axis=1)
+    windows = Windows.of(designs)
+    if windows is not None:
+        require_memory(
+            pairs_bytes(windows.most_entries(), weights.shape[1]),
+            f"a fit of {len(designs)} elements on {designs[0].shape[1]} knots",
+        )
     return Moments(
-        pairs=[_pairs(designs, weights[:, g]) for g in range(weights.shape[1])],
+        pairs=[Pairs.of(designs, windows, weights[:, g]) for g in range(weights.shape[1])],
         group=group,
         cross=cross,
         energy=np.sum(weighted * data, axis=0),
@@ -165,37 +210,12 @@ def _alike(inverse_variance: Array) -> tuple[Array, NDArray[np.intp]]:
     return weights, np.asarray(group).ravel().astype(np.intp)
 
 
-def _pairs(designs: list[sp.csr_array], weight: Array) -> Pairs:
-    elements, size = len(designs), designs[0].shape[1]
-    transposed = [sp.csr_array(t.T) for t in designs]
-    blocks: dict[tuple[int, int], sp.csr_array] = {}
-    for j, right in enumerate(designs):
-        scaled = sp.csr_array(
-            (right.data * np.repeat(weight, np.diff(right.indptr)), right.indices, right.indptr), right.shape
-        )
-        for i in range(j + 1):
-            blocks[i, j] = sp.csr_array(transposed[i] @ scaled)
-    return _laid_out(blocks, elements, size)
-
-
-def _laid_out(blocks: dict[tuple[int, int], sp.csr_array], elements: int, size: int) -> Pairs:
-    """N_ij for i <= j in the layout that their uses want."""
-    where, values, diagonal = [], [], np.zeros(size)
-    for j in range(elements):
-        for i in range(j + 1):
-            gram = blocks[i, j]
-            row = np.repeat(np.arange(size, dtype=np.int64), np.diff(gram.indptr))
-            where.append(row * size + gram.indices)
-            if i == j:
-                diagonal += gram.diagonal()
-                values.append(0.5 * gram.data)
-            else:
-                values.append(gram.data)
-    every = [blocks[i, j] if i <= j else sp.csr_array(blocks[j, i].T) for i in range(elements) for j in range(elements)]
-    return Pairs(
-        stacked=sp.csr_array(sp.vstack(every, format="csr")),
-        where=np.concatenate(where),
-        values=np.concatenate(values),
-        counts=np.array([v.size for v in values]),
-        diagonal=diagonal,
-    )
+def _sparse_grams(designs: list[sp.csr_array], weight: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+    """As `Windows.grams`, for matrices whose rows are no runs."""
+    scaled = [
+        sp.csr_array((t.data * np.repeat(weight, np.diff(t.indptr)), t.indices, t.indptr), t.shape) for t in designs
+    ]
+    grams = [sp.csr_array(t.T @ right) for i, t in enumerate(designs) for right in scaled[i:]]
+    entries = np.concatenate([np.diff(gram.indptr) for gram in grams])
+    columns = np.concatenate([gram.indices for gram in grams])
+    return entries, columns.astype(np.intp), np.concatenate([gram.data for gram in grams])

@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from wallmirror.derendering.components import in_words
 from wallmirror.derendering.estimate import Estimate, doubts_of_fit, scale_free_error
 from wallmirror.derendering.knots import NOISY_STEPS, Refined, refine
 from wallmirror.derendering.patterns import trusted_bound
@@ -52,6 +53,7 @@ def solve_noisy(
     level, rival = refined.level, refined.rival
     grid, fit = level.grid, level.fit
     transport = np.stack([t @ fit.coefficients for t in level.designs], axis=1)
+    apart = level.groups.elements if len(level.groups) > 1 else ()
     stated = problem.noise_is_stated
     reduced = reduced_misfit(problem, transport, fit.source, level.parameters + fit.source.size)
     # Where the noise is stated, a misfit beyond it widens the bars; where it is not, the misfit is the noise.
@@ -65,7 +67,7 @@ def solve_noisy(
     if not stated and _still_falls(refined):
         # What is left is the spline's own error, which the bound knows nothing of.
         assert refined.before is not None
-        moved = scale_free_error(refined.before.source, fit.source)
+        moved = scale_free_error(refined.before.source, fit.source, apart)
         if moved > predicted:
             shape_std = shape_std * (moved / predicted)
             predicted = moved
@@ -75,12 +77,14 @@ def solve_noisy(
             )
     warnings += doubts_of_fit(converged=fit.converged, misfit=reduced if stated else None)
     if rival is not None:
-        moved = scale_free_error(rival.source, level.free.source)
+        moved = scale_free_error(rival.source, level.free.source, apart)
         if moved > _STEADY * predicted:
             warnings.append(
                 f"the pattern moves by {100 * moved:.2g} % when the BRDF's knots are halved, where its error bars allow "
                 f"{100 * predicted:.2g} %: the captures hardly tell the BRDF's detail from the pattern"
             )
+    if apart:
+        warnings.append(in_words(apart))
     return Estimate(
         method="maximum_likelihood",
         grid=grid,
@@ -95,6 +99,9 @@ def solve_noisy(
         predicted_error=predicted,
         chi_squared=reduced if stated else math.nan,
         warnings=tuple(warnings),
+        designs=level.designs,
+        information=level.information,
+        groups=apart,
     )
 
 

@@ -18,8 +18,9 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from wallmirror.derendering.bounds import Bound, bound_of
+from wallmirror.derendering.bounds import Bound, bound_of, require_order_one
 from wallmirror.derendering.convex import minimise_above, solve_positive
+from wallmirror.derendering.information import Information
 from wallmirror.derendering.poisson_information import Products, information_of_counts, seen_cells, transport_of
 from wallmirror.errors import InputError
 
@@ -184,7 +185,13 @@ def poisson_bound(
         c, shape (K,): the values of the basis functions at the peak of rho.
     background:
         Known mean of the counts without the card, broadcast to (P, B).
+
+    Raises
+    ------
+    InputError
+        For a background below zero, or a pattern whose powers leave the range of float64.
     """
+    require_order_one(source)
     shape = (designs[0].shape[0], source.shape[1])
     data = _checked(np.zeros(shape), designs, background, used)
     seen = seen_cells(designs)
@@ -194,7 +201,8 @@ def poisson_bound(
     schur, inverse, coupled = information_of_counts(
         Products(designs), coefficients, source, weights, np.flatnonzero(seen), free
     )
-    return bound_of(schur, inverse, coupled, seen=seen, coefficients=coefficients, source=source, gauge=gauge)
+    known = Information(schur, inverse, coupled, seen)
+    return bound_of(known, coefficients=coefficients, source=source, gauge=gauge)
 
 
 def _checked(
@@ -220,9 +228,12 @@ def _least_squares(data: _Counts, r: Array) -> Array:
 def _fit(
     data: _Counts, r: Array, v: Array, mean: Array, least: float, gain: float, iterations: int, *, converged: bool
 ) -> PoissonFit:
-    pearson = float(np.sum((data.counts - mean) ** 2 * data.weights(mean, least)))
-    freedom = int(np.count_nonzero(data.used)) - int(np.count_nonzero(r)) - int(np.count_nonzero(v)) + 1
-    return PoissonFit(r, v, gain, pearson / max(1, freedom), iterations, converged)
+    weights = data.weights(mean, least)
+    pearson = float(np.sum((data.counts - mean) ** 2 * weights))
+    # A pixel in which hardly any light is expected adds hardly anything to the sum, and frees no more.
+    expected = float(np.sum(np.maximum(mean, 0.0) * weights))
+    freedom = expected - int(np.count_nonzero(r)) - int(np.count_nonzero(v)) + 1
+    return PoissonFit(r, v, gain, pearson / max(1.0, freedom), iterations, converged)
 
 
 def _scoring_step(

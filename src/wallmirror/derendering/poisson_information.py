@@ -11,6 +11,8 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from wallmirror.derendering.information import unseen_pattern
+
 Array = NDArray[np.float64]
 
 # Cells whose Fisher information lies this far below the best-seen cell's are left out.
@@ -91,7 +93,10 @@ def information_of_counts(
     both = free.T[:, :, None] & free.T[:, None, :]
     trace = np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-300
     normal = np.where(both, normal, np.eye(m) * trace)
-    inverse = np.where(both, np.linalg.inv(normal + 1e-14 * trace * np.eye(m)), 0.0)
+    try:
+        inverse = np.where(both, np.linalg.inv(normal + 1e-14 * trace * np.eye(m)), 0.0)
+    except np.linalg.LinAlgError:
+        raise unseen_pattern() from None
     coupling = coupling[:, :, cells]
     coupled = inverse @ coupling
     schur = total[np.ix_(cells, cells)]

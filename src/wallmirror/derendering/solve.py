@@ -19,7 +19,7 @@ from wallmirror.captures import CaptureSet
 from wallmirror.derendering.angle_sum_check import check_angle_sum, with_doubt
 from wallmirror.derendering.angle_sum_quiet import check_angle_sum_quietly
 from wallmirror.derendering.calibration import Calibration
-from wallmirror.derendering.counting import solve_counts, with_counting_noise
+from wallmirror.derendering.counting import prepare_counts, solve_counts
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.exact import solve_exactly
 from wallmirror.derendering.facet_fit import WallModel, settle_wall
@@ -153,12 +153,13 @@ def solve(
         if progress is not None:
             progress(stage)
 
-    if method == "poisson":
-        assert counts_per_radiance is not None
-        captures = with_counting_noise(captures, per_radiance=counts_per_radiance, background=background)
     # The matrices are small: two BLAS threads that wait for each other are up to a hundred times slower than one.
     with threadpool_limits(limits=1, user_api="blas"):
-        problem, space = prepare(captures, few_captures=few, weak_patterns=method != "closed_form")
+        if method == "poisson":
+            assert counts_per_radiance is not None
+            problem, space = prepare_counts(captures, per_radiance=counts_per_radiance, background=background)
+        else:
+            problem, space = prepare(captures, few_captures=few, weak_patterns=method != "closed_form")
 
         def fit(problem: Problem) -> Estimate:
             if method != "poisson":
@@ -222,14 +223,16 @@ def solve(
                 if not quiet or exact is None:
                     raise
                 problem, estimate = held, exact  # refused below, and the closed form knows the better reason
-        if estimate.method != "closed_form" and estimate.predicted_error <= UNDETERMINED:
-            problem, estimate, angle_sum = settle(problem, estimate, refit if few else fit, check_angle_sum)
+            if quiet and exact is not None and estimate.groups:
+                problem, estimate = held, exact  # without noise it tells whether a scale each is all that is free
         if wall == "microfacet" and estimate.groups:
             raise UndeterminedError(
                 "a scale is open for each group of elements, and with it the exponents of a wall of facets; use views or a "
                 "card whose reflections share more angles"
             )
-        if angle_sum is not None:
+        if estimate.method != "closed_form" and estimate.predicted_error <= UNDETERMINED and not estimate.groups:
+            problem, estimate, angle_sum = settle(problem, estimate, refit if few else fit, check_angle_sum)
+        if angle_sum is not None and not estimate.groups:
             estimate = with_doubt(estimate, angle_sum)
         if calibration is not None:
             tell(f"the same with the card one standard deviation aside, {len(calibration.aside)} times")

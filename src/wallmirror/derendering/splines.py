@@ -6,9 +6,11 @@ With rho(u) = sum_k r_k phi_k(u) the transport of each element is linear in r: F
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from fractions import Fraction
 
 import numpy as np
 import scipy.sparse as sp
@@ -60,20 +62,19 @@ class SplineGrid:
     def basis(self, u: ArrayLike) -> tuple[NDArray[np.intp], Array]:
         """First index and the degree + 1 non-zero values at each u; shapes u.shape and (degree + 1, *u.shape).
 
-        Cardinal B-spline recursion of Cox and de Boor; angles outside the grid are clipped to its ends.
+        The pieces of the cardinal B-spline as polynomials in the place within the interval, seen from its middle, where
+        they lose no more than a rounding; angles outside the grid are clipped to its ends.
         """
         place = np.clip((np.asarray(u, dtype=np.float64) - self.start) / self.step, 0.0, self.intervals)
         first = np.minimum(place.astype(np.intp), self.intervals - 1)
-        t = place - first
-        values = np.empty((self.degree + 1, *t.shape))
-        values[0] = 1.0
-        for k in range(1, self.degree + 1):
-            # values[r] becomes b_k(t + k - r), coefficient first + r; downwards, as it reads values[r - 1].
-            values[k] = t * values[k - 1] / k
-            for r in range(k - 1, 0, -1):
-                values[r] = ((t + (k - r)) * values[r - 1] + (1 + r - t) * values[r]) / k
-            values[0] *= (1 - t) / k
-        return first, values
+        powers = np.empty((self.degree + 1, *place.shape))
+        powers[0] = 1.0
+        if self.degree > 0:
+            np.subtract(place, first + 0.5, out=powers[1, ...])
+        for k in range(2, self.degree + 1):
+            np.multiply(powers[k - 1], powers[1], out=powers[k, ...])
+        values = _pieces(self.degree) @ powers.reshape(self.degree + 1, -1)
+        return first, values.reshape(powers.shape)
 
     def interpolate(self, function: Callable[[Array], Array]) -> Array:
         """Coefficients that reproduce a smooth function closely (Schoenberg: its values at the supports' middles)."""
@@ -139,6 +140,26 @@ class SplineGrid:
         return np.where((u >= self.start) & (u <= self.stop), total, 0.0)
 
 
+@functools.cache
+def _pieces(degree: int) -> Array:
+    """Coefficients of 1, x, x^2, ... of the degree + 1 splines over an interval that x runs through from -1/2 to 1/2.
+
+    The recursion of Cox and de Boor in fractions, so that what it cancels costs no digit.
+    """
+    pieces = [[Fraction(1)]]
+    for k in range(1, degree + 1):
+        before, pieces = [[], *pieces, []], []
+        for r in range(k + 1):
+            # With t = x + 1/2: [(t + k - r) b_(r-1) + (1 + r - t) b_r] / k.
+            left, right = (piece + [Fraction(0)] * (k - len(piece)) for piece in before[r : r + 2])
+            rise, fall = Fraction(2 * (k - r) + 1, 2), Fraction(2 * r + 1, 2)
+            piece = [(rise * a + fall * b) / k for a, b in zip(left, right, strict=True)] + [Fraction(0)]
+            for power, (a, b) in enumerate(zip(left, right, strict=True)):
+                piece[power + 1] += (a - b) / k
+            pieces.append(piece)
+    return np.array(pieces, dtype=np.float64)
+
+
 def grid_for(kernel: Kernel, *, step: float, degree: int) -> SplineGrid:
     """The grid that covers every angle sum of a kernel."""
     u = kernel.theta_s + kernel.theta_o
@@ -153,13 +174,12 @@ def design_matrices(kernel: Kernel, grid: SplineGrid) -> list[sp.csr_array]:
         f"the solver's {grid.size} knots at {views} views x {pixels} pixels x {elements} elements x {nodes} nodes",
     )
     rows = views * pixels
-    first, values = grid.basis(kernel.angle_sum)
-    order = grid.degree + 1
+    u, weight = kernel.angle_sum, kernel.weight
     matrices = []
-    for i in range(elements):
-        columns = first[:, :, i].reshape(rows, nodes)
-        weighted = (values[:, :, :, i] * kernel.weight[:, :, i]).reshape(order, rows, nodes)
-        matrices.append(_banded_rows(columns, weighted, grid.size))
+    for i in range(elements):  # one at a time, since its nodes and what the recursion makes of them fit into a cache
+        first, values = grid.basis(u[:, :, i].reshape(rows, nodes))
+        values *= weight[:, :, i].reshape(rows, nodes)
+        matrices.append(_banded_rows(first, values, grid.size))
     return matrices
 
 
@@ -170,19 +190,19 @@ def _banded_rows(columns: NDArray[np.intp], weighted: Array, size: int) -> sp.cs
     width = int((columns.max(axis=1) - begin).max()) + order
     width = min(width, size)
     begin = np.minimum(begin, size - width)
-    if nodes == 1:
+    if nodes == 1 and width == order:
+        data = weighted[:, :, 0].T
+    elif nodes == 1:
         data = np.zeros((rows, width))
         offset = columns[:, 0] - begin
-        if width == order:
-            data[:] = weighted[:, :, 0].T
-        else:
-            data[np.arange(rows)[:, None], offset[:, None] + np.arange(order)] = weighted[:, :, 0].T
+        data[np.arange(rows)[:, None], offset[:, None] + np.arange(order)] = weighted[:, :, 0].T
     else:
         flat = np.zeros(rows * width)
         base = (np.arange(rows) * width - begin)[:, None] + columns
         for k in range(order):
             flat += np.bincount((base + k).ravel(), weights=weighted[k].ravel(), minlength=rows * width)
         data = flat.reshape(rows, width)
-    indices = (begin[:, None] + np.arange(width)).ravel()
-    pointers = np.arange(rows + 1) * width
-    return sp.csr_array((data.ravel(), indices, pointers), shape=(rows, size))
+    narrow = np.int32 if rows * width < np.iinfo(np.int32).max else np.int64
+    indices = begin.astype(narrow)[:, None] + np.arange(width, dtype=narrow)
+    pointers = np.arange(rows + 1, dtype=narrow) * narrow(width)
+    return sp.csr_array((data.ravel(), indices.ravel(), pointers), shape=(rows, size))

@@ -228,7 +228,7 @@ def banded_gram(designs: list[sp.csr_array]) -> Array:
     without a sparse product.
     """
     size = designs[0].shape[1]
-    widths = [_run_length(t) for t in designs]
+    widths = [run_length(t) for t in designs]
     if 0 in widths:
         return _band_of(sp.csr_array(sum(t.T @ t for t in designs)))
     band = np.zeros((max(widths), size))
@@ -241,7 +241,7 @@ def banded_gram(designs: list[sp.csr_array]) -> Array:
     return band
 
 
-def _run_length(design: sp.csr_array) -> int:
+def run_length(design: sp.csr_array) -> int:
     """Number of columns in each row where all rows are runs of neighbouring columns of equal length, and 0 elsewhere."""
     width = int(design.nnz // design.shape[0])
     if width == 0 or np.any(np.diff(design.indptr) != width):

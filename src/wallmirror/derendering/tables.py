@@ -82,10 +82,12 @@ class SplineTable(BRDF):
     determined: NDArray[np.bool_] = field(repr=False)
 
     def __call__(self, theta_s: ArrayLike, theta_o: ArrayLike) -> Array:
-        """Value, broadcast over two arrays of angles in radians."""
+        """Value, broadcast over two arrays of angles in radians; beyond the knots that at their end, NaN where one is NaN."""
         s, o = np.broadcast_arrays(np.asarray(theta_s, dtype=np.float64), np.asarray(theta_o, dtype=np.float64))
-        rows = self.grid.rows(s.reshape(-1, 1), o.reshape(-1, 1), np.ones((s.size, 1)))
-        return np.asarray(rows @ self.coefficients, dtype=np.float64).reshape(s.shape)
+        known = ~(np.isnan(s) | np.isnan(o))
+        s, o = (np.where(known, angles, 0.0).reshape(-1, 1) for angles in (s, o))
+        values = self.grid.rows(s, o, np.ones(s.shape)) @ self.coefficients
+        return np.where(known, np.asarray(values, dtype=np.float64).reshape(known.shape), np.nan)
 
     def seen(self, theta_s: ArrayLike, theta_o: ArrayLike) -> NDArray[np.bool_]:
         """Whether the captures, and not the ridge, decide the value there (at the nearest node)."""
@@ -102,5 +104,5 @@ class SplineTable(BRDF):
 def _node(grid: SplineGrid, angle: ArrayLike, nodes: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """The nearest of the uniform nodes over a knot range, and whether the angle lies in that range."""
     place = (np.asarray(angle, dtype=np.float64) - grid.start) / (grid.stop - grid.start)
-    nearest = np.clip(np.rint(place * (nodes - 1)), 0, nodes - 1).astype(np.intp)
+    nearest = np.clip(np.rint(np.where(np.isnan(place), 0.0, place) * (nodes - 1)), 0, nodes - 1).astype(np.intp)
     return nearest, np.asarray((place >= 0) & (place <= 1))

@@ -87,6 +87,8 @@ def advise(
     started = time.perf_counter()
     tell = progress or (lambda _: None)
     checked_tolerance(tolerance)
+    # All errors are relative; in a power of two near the brightest strip nothing leaves the range of float64.
+    scene = replace(scene, source=np.ldexp(scene.source, -math.frexp(float(scene.source.max(initial=0.0)))[1]))
     notes: list[str] = []
     filmed = filmable(scene)
     if not filmed:

@@ -232,7 +232,9 @@ def _ratio(above: Array, below: Array, rounding: float = 0.0) -> Measured:
 
 
 def spread(available: int, wanted: int) -> tuple[int, ...]:
-    """Indices of `wanted` out of `available` things, spread evenly over them."""
+    """Indices of `wanted` out of `available` things, spread evenly over them; all where more are wanted."""
+    if wanted >= available:
+        return tuple(range(available))
     return tuple(int(v) for v in np.unique(np.linspace(0, available - 1, wanted).round().astype(int)))
 
 

@@ -26,6 +26,9 @@ from wallmirror.report.figures import recovered_brdf, recovered_source, scene_pl
 
 Array = NDArray[np.float64]
 
+# An error this many times the one asked for is none that more light would mend.
+_HOPELESS = 1e6
+
 
 @dataclass(frozen=True)
 class Judgement:
@@ -67,10 +70,11 @@ class Solved:
                 f"{100 * tolerance:.3g} % asked for; no samples mend that, a darker card or room does"
             )
         if s.predicted_error > tolerance:
-            more = (s.predicted_error / tolerance) ** 2
+            ratio = s.predicted_error / tolerance
+            more = f"about {ratio * ratio:.2g} times as many samples a pixel, or views, would do"
             return (
-                f"the pattern is known to {100 * s.predicted_error:.2g} %, not to the {100 * tolerance:.3g} % asked for; about "
-                f"{more:.2g} times as many samples a pixel, or views, would do"
+                f"the pattern is known to {100 * s.predicted_error:.2g} %, not to the {100 * tolerance:.3g} % asked for; "
+                + (more if ratio < _HOPELESS else "no number of samples would do")
             )
         return ""
 
@@ -132,14 +136,15 @@ def solve_directory(
 
 
 def judge(solution: Solution, truth: Truth | None) -> Judgement | None:
-    """Compare a solution with the truth of a rendered capture set; None where there is no truth."""
-    if truth is None or truth.source.shape != solution.source.shape:
+    """Compare a solution with the truth of a rendered capture set; None where there is no truth, or a dark one."""
+    if truth is None or truth.source.shape != solution.source.shape or not np.any(truth.source):
         return None
     rho = true_brdf(solution, truth)
     brdf_error = math.nan
     if rho is not None and solution.components == 1:
         seen = well_seen(solution)
-        brdf_error = scale_free_error(solution.brdf[seen], rho[seen])
+        if np.any(rho[seen]):
+            brdf_error = scale_free_error(solution.brdf[seen], rho[seen])
     return Judgement(scale_free_error(solution.source, truth.source, solution.groups), brdf_error)
 
 

@@ -41,6 +41,8 @@ class GeneralSolved:
         s = self.solution
         return {
             "status": s.status,
+            "verdict": s.verdict,
+            "warnings": list(s.warnings),
             "method": s.method,
             "positions": [list(c.observer.position) for c in self.captures],
             "reciprocal": s.brdf.grid.reciprocal,
@@ -82,7 +84,8 @@ def solve_directories(
     captures = tuple(read_captures(directory) for directory in directories)
     solution = solve_general(captures, reciprocal=reciprocal, step_deg=step_deg, progress=progress)
     known = read_truth(directories[0])
-    truth = known.source if known is not None and known.source.shape == solution.source.shape else None
+    fits = known is not None and known.source.shape == solution.source.shape and bool(np.any(known.source))
+    truth = known.source if known is not None and fits else None
     error = None if truth is None else scale_free_error(solution.source, truth)
     solved = GeneralSolved(captures, solution, truth, error)
     _write(out, solved)
@@ -136,7 +139,7 @@ def _write(out: Path, solved: GeneralSolved) -> None:
 def _verdicts(solved: GeneralSolved) -> list[Verdict]:
     s, error = solved.solution, solved.source_error
     if error is None:
-        return [Verdict(True, "The captures determine pattern and table.")]
+        return [Verdict(not s.warnings, s.status if s.warnings else "The captures determine pattern and table.")]
     return [
         Verdict(
             error <= 2 * s.predicted_error,

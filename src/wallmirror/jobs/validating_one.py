@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from wallmirror.comparison import Comparison, compare, cross_weights
 from wallmirror.console import Advance
+from wallmirror.jobs.bouncing import spread
 from wallmirror.jobs.expecting import Expectation, expect
 from wallmirror.pathtracing.rendering import Renderer, spread_seeds
 from wallmirror.scene import Scene
@@ -143,8 +144,7 @@ def render_seeds(
     progress: Advance | None = None,
 ) -> Sample:
     """The rendered side, with parameters as for `validate_scene`, and `count` seeds."""
-    last = scene.observer.views - 1
-    chosen = tuple(int(v) for v in np.unique(np.linspace(0, last, views).round().astype(int)))
+    chosen = spread(scene.observer.views, views)
     # Looking through a board displaces what is seen by a hundredth of a pixel (see `building`), which this test would
     # notice. At one bounce the board has no other effect, so it is taken away.
     bare = replace(scene, card=replace(scene.card, board_width=0.0, board_height=0.0))

@@ -10,7 +10,9 @@ from wallmirror.report.figures import radiance_maps, scene_plan, score_histogram
 def verdict(result: Validation) -> Verdict:
     """One sentence on one scene."""
     gain = result.comparison.gain
-    if result.comparison.exact and result.fine_enough:
+    if result.comparison.kept == 0 or not result.reference.any():
+        text = f"{result.scene.name}: NOTHING COMPARED; no pixel away from the strips' edges is lit"
+    elif result.comparison.exact and result.passed:
         text = f"{result.scene.name}: agrees to {result.comparison.relative_rms:.1e} of the brightest pixel"
     elif result.passed:
         text = (

@@ -13,6 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wallmirror.errors import InputError
+from wallmirror.table_files import read_npy
+
 
 @dataclass(frozen=True)
 class UniformNodes:
@@ -126,16 +129,12 @@ def loaded_table(path: Path) -> NDArray[np.float64]:
     Raises
     ------
     ValueError
-        If the file is missing, is no .npy file, or holds something else than real numbers.
+        If the file is missing, too long, no .npy file, or holds something else than real numbers.
     """
     try:
-        with path.open("rb") as stream:
-            table = np.lib.format.read_array(stream, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise ValueError(f"the BRDF table {path} cannot be read as a .npy file: {error}") from None
-    if table.dtype.kind not in "fiu":
-        raise ValueError(f"the BRDF table {path} holds {table.dtype} instead of real numbers")
-    return table.astype(np.float64)
+        return read_npy(path)
+    except InputError as error:
+        raise ValueError(f"the BRDF table {path}: {error.message}") from None
 
 
 def given_table(mi: Any, props: Any, dimensions: int) -> NDArray[np.float32]:

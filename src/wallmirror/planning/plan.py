@@ -50,7 +50,7 @@ def total_error(terms: tuple[Term, ...]) -> float:
     0.5
     """
     bias = sum(t.error for t in terms if t.kind == "bias")
-    return math.sqrt(bias**2 + sum(t.error**2 for t in terms if t.kind == "noise"))
+    return math.hypot(bias, *(t.error for t in terms if t.kind == "noise"))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,6 +24,10 @@ LEAST_SEEDS = 8
 _LEAST_SPP = 16
 
 
+# Noise falls as one over the root of the samples, of which nobody takes more than the square of this.
+_MOST_RATIO = 1e9
+
+
 @dataclass(frozen=True, kw_only=True)
 class NoiseLevel:
     """What one seed of a pilot render cost and how noisy it was.
@@ -85,7 +89,8 @@ def cheapest_sampling(levels: Sequence[NoiseLevel], *, noise: float) -> Sampling
     Raises
     ------
     InputError
-        If the noise wanted is not positive, or there is no pilot.
+        If the noise wanted is not positive and finite, or so small that no number of samples gives it, and for no pilot or
+        one whose noise or seconds are negative or not finite.
 
     Examples
     --------
@@ -93,8 +98,16 @@ def cheapest_sampling(levels: Sequence[NoiseLevel], *, noise: float) -> Sampling
     >>> cheapest_sampling([pilot], noise=0.01).seeds
     16
     """
-    if not (noise > 0 and levels):
+    if not (0 < noise < math.inf and levels):
         raise InputError(f"is {noise:g}; give a noise > 0 and a pilot render", field="noise")
+    for pilot in levels:
+        if not (0 <= pilot.noise < math.inf and 0 <= pilot.seconds < math.inf):
+            raise InputError(f"has a noise of {pilot.noise:g} in {pilot.seconds:g} s; give numbers >= 0", field="pilot")
+        if pilot.noise > _MOST_RATIO * noise:
+            raise InputError(
+                f"is {noise:g}, {pilot.noise / noise:.0e} times less than a pilot's; no number of samples gives that",
+                field="noise",
+            )
     candidates = [*_independent([p for p in levels if p.sampler == "independent"], noise)]
     for pilot in levels:
         if pilot.sampler == "multijitter":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
+from wallmirror.errors import InputError
 from wallmirror.tradeoff.runs import Run
 
 #: How the seconds to an error are known: by a run that got there, between two runs, or along a line beyond all runs.
@@ -57,8 +59,11 @@ class Line:
         return float(self.factor * x**self.slope)
 
     def where(self, y: float) -> float:
-        """x at which the line takes the value y."""
-        return float(math.exp(math.log(y / self.factor) / self.slope))
+        """x at which the line takes the value y > 0, inf beyond float64; InputError for a level line or another y."""
+        if self.slope == 0 or not 0 < y < math.inf:
+            raise InputError(f"of slope {self.slope:g} takes the value {y:g} nowhere, or everywhere", field="line")
+        power = (math.log(y) - math.log(self.factor)) / self.slope
+        return math.exp(power) if power < math.log(sys.float_info.max) else math.inf
 
     def half_width(self, level: float = 0.95) -> float:
         """Half of the slope's confidence interval, by Student's t from the number of points behind the error."""
@@ -66,14 +71,24 @@ class Line:
 
 
 def fit_line(x: ArrayLike, y: ArrayLike) -> Line:
-    """Least squares of log y over log x; all values positive, at least two different x.
+    """Least squares of log y over log x.
+
+    Raises
+    ------
+    InputError
+        For a value that is not positive and finite, and for fewer than two different x.
 
     Examples
     --------
     >>> round(fit_line([1, 10, 100], [5, 0.5, 0.05]).slope, 12)
     -1.0
     """
-    log_x, log_y = np.log(np.asarray(x, dtype=np.float64)), np.log(np.asarray(y, dtype=np.float64))
+    x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    if x.shape != y.shape or np.unique(x).size < 2:
+        raise InputError(f"has {x.size} places for {y.size} values; give two different ones at least", field="line")
+    if not (np.all((x > 0) & (x < np.inf)) and np.all((y > 0) & (y < np.inf))):
+        raise InputError("holds a value that is not positive and finite, which has no logarithm", field="line")
+    log_x, log_y = np.log(x), np.log(y)
     centred = log_x - log_x.mean()
     spread = float(np.sum(centred**2))
     slope = float(np.sum(centred * log_y)) / spread
@@ -149,6 +164,8 @@ def reach_along_line(runs: Sequence[Run], error: float, *, floor: float = 0.0) -
     last = above[-1]
     if last + 1 < len(good):
         a, b = good[last], good[last + 1]
+        if b.error == 0 or error == 0:  # no line leads there
+            return Reach(b.seconds, "measured")
         share = math.log(a.error / error) / math.log(a.error / b.error)
         return Reach(a.seconds * (b.seconds / a.seconds) ** share, "interpolated")
     line = tail_line(good)

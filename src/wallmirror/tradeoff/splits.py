@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wallmirror.brdf import AngleSumBRDF
+from wallmirror.errors import InputError
 from wallmirror.geometry import scan_angles
 from wallmirror.scene import Scene
 from wallmirror.tradeoff.clock import once
@@ -58,6 +59,12 @@ class Costs:
     sample: float
     scatter: float
     doubt: float
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.start < math.inf and 0 < self.sample < math.inf):
+            raise InputError(
+                f"are {self.start:g} and {self.sample:g} s; give a start >= 0 and a sample > 0", field="costs"
+            )
 
 
 class World:
@@ -125,7 +132,9 @@ def sampling_noise(costs: Costs, world: World) -> Noise:
 
 
 def affordable(seconds: float, costs: Costs) -> int:
-    """Samples per pixel of one render that so many seconds pay for, 0 if not one."""
+    """Samples per pixel of one render that so many seconds pay for, 0 if not one; InputError where they are no number >= 0."""
+    if not 0 <= seconds < math.inf:
+        raise InputError(f"is {seconds:g}; give a number >= 0", field="seconds")
     whole = costs.start + PASS * costs.sample
     passes = math.floor(seconds / whole)
     rest = seconds - passes * whole - costs.start

@@ -80,10 +80,26 @@ def _more(order: int, half_width: float) -> int:
 
 
 def radiance(transport: ArrayLike, source: ArrayLike) -> Array:
-    """Render L_r = F V: (A, N, M) and (M, B) to (A, N, B) (eqs. 4.10 to 4.12)."""
-    return np.asarray(transport, dtype=np.float64) @ np.asarray(source, dtype=np.float64)
+    """Render L_r = F V: (A, N, M) and (M, B) to (A, N, B), or (M,) to (A, N) (eqs. 4.10 to 4.12).
+
+    Raises
+    ------
+    InputError
+        For another number of elements, and where a value of F, V or their product is not finite.
+    """
+    f, v = np.asarray(transport, dtype=np.float64), np.asarray(source, dtype=np.float64)
+    if f.ndim < 2 or v.ndim not in (1, 2) or f.shape[-1] != v.shape[0]:
+        raise InputError(f"has shape {v.shape}, F {f.shape}; give a radiance for each element", field="source")
+    with np.errstate(over="ignore", invalid="ignore"):
+        rendered: Array = f @ v
+    if not np.all(np.isfinite(rendered)):
+        raise InputError("or F holds a value that is not finite, or F V leaves the range of float64", field="source")
+    return rendered
 
 
 def brdf_matrices(transport: ArrayLike) -> tuple[Array, ...]:
-    """The A matrices B_a of section 4.1.2, each (N, M); B is `np.hstack` of them."""
-    return tuple(np.asarray(transport, dtype=np.float64))
+    """The A matrices B_a of section 4.1.2, each (N, M), of F (A, N, M), finite; B is `np.hstack` of them."""
+    matrices = np.asarray(transport, dtype=np.float64)
+    if matrices.ndim != 3 or not np.all(np.isfinite(matrices)):
+        raise InputError(f"has shape {matrices.shape}; give a finite F, (A, N, M)", field="transport")
+    return tuple(matrices)

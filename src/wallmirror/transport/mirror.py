@@ -9,7 +9,7 @@ import numpy as np
 from wallmirror.brdf import Mirror
 from wallmirror.errors import InputError
 from wallmirror.geometry import Array, Card, Observer, incident_angles, pixel_half_width, pixel_tangents, wall_points
-from wallmirror.transport.nodes import Weights
+from wallmirror.transport.nodes import Weights, require_weights
 
 
 def mirror_matrix(observer: Observer, card: Card, mirror: Mirror, *, weights: Weights = "physical") -> Array:
@@ -18,6 +18,7 @@ def mirror_matrix(observer: Observer, card: Card, mirror: Mirror, *, weights: We
     The observer sees the strip as if from its own image behind the wall. With "thesis" and "cosine" weights
     each element lights the one pixel that its image falls into, with 1 or cos theta_s: a delta has no width.
     """
+    require_weights(weights)
     t = pixel_tangents(observer)
     x_o = observer.position[0]
     depth = observer.distance + card.distance
@@ -59,5 +60,5 @@ def mirror_matrix(observer: Observer, card: Card, mirror: Mirror, *, weights: We
     seen = np.zeros(low.shape)
     for a, b in ((low, bend), (bend, high)):
         seen += (b - a) * np.minimum(1.0, strip * (slope + 0.5 * (a + b) * rise))
-    matrix: Array = mirror.reflectance * seen / (2 * half)
+    matrix: Array = mirror.reflectance * (seen / (2 * half))
     return matrix

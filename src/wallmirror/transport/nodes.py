@@ -22,7 +22,7 @@ from wallmirror.geometry import (
     pixel_tangents,
     wall_points,
 )
-from wallmirror.quadrature import MAX_ORDER, gauss_legendre, quadrature_order
+from wallmirror.quadrature import MAX_ORDER, gauss_legendre, order_across_peak, quadrature_order
 from wallmirror.transport.strips import mean_strip_factor
 
 #: What stands in front of the BRDF; see the text of `wallmirror.transport`.
@@ -52,8 +52,7 @@ class Nodes:
 
     @classmethod
     def of(cls, observer: Observer, card: Card, weights: Weights) -> Nodes:
-        if weights not in get_args(Weights):
-            raise InputError(f'is "{weights}"; choose one of {", ".join(get_args(Weights))}', field="transport")
+        require_weights(weights)
         points = weights != "physical"
         half_pixel = 0.0 if points else pixel_half_width(observer)
         return cls(observer, card, weights, half_pixel, 0.0 if points else card.element_width / 2)
@@ -62,12 +61,19 @@ class Nodes:
         """The orders across pixel and strip that resolve lobes of this width in radians."""
         pixel_turn, strip_turn = _extent_in_angle(self.observer, self.card, self.half_pixel, self.half_strip)
         # The weight in front of the BRDF varies over angles as well, about as a lobe of this width does.
+        for name, value in (("resolution", resolution), ("tolerance", tolerance)):
+            if not value > 0:
+                raise InputError(f"is {value:g}; give a number > 0", field=name)
         scale = 1 / math.hypot(1 / resolution, 1 / _WEIGHT_SCALE)
-        return quadrature_order(pixel_turn / scale, tolerance), quadrature_order(strip_turn / scale, tolerance)
+        pixel, strip = (
+            max(quadrature_order(turn / scale, tolerance), order_across_peak(turn, tolerance))
+            for turn in (pixel_turn, strip_turn)
+        )
+        return pixel, strip
 
     def checked(self, orders: tuple[int, int]) -> tuple[int, int]:
         """Orders that somebody asked for, 1 where there is nothing to integrate over."""
-        if not all(1 <= order <= MAX_ORDER for order in orders):
+        if len(orders) != 2 or not all(isinstance(n, (int, np.integer)) and 1 <= n <= MAX_ORDER for n in orders):
             raise InputError(f"are {orders}; give 1 to {MAX_ORDER} nodes across pixel and strip", field="orders")
         return orders[0] if self.half_pixel > 0 else 1, orders[1] if self.half_strip > 0 else 1
 
@@ -143,10 +149,17 @@ class Nodes:
         return np.arctan(slope), theta_o, weight
 
 
+def require_weights(weights: str) -> None:
+    """Raise InputError unless these are weights."""
+    if weights not in get_args(Weights):
+        raise InputError(f'is "{weights}"; choose one of {", ".join(get_args(Weights))}', field="transport")
+
+
 def _extent_in_angle(observer: Observer, card: Card, half_pixel: float, half_strip: float) -> tuple[float, float]:
     """What one pixel and one strip would span in u, in radians, if u ran everywhere as fast as where it is fastest.
 
-    A chord from end to end would miss how u bends: under a near card it runs fast in the middle of a wide pixel.
+    A chord from end to end would miss how u bends: under a near card it runs fast in the middle of a wide pixel, and
+    fastest right below the element, which chords of parts that are wide against the card's distance would miss as well.
     """
     if half_pixel == 0 and half_strip == 0:
         return 0.0, 0.0
@@ -157,12 +170,25 @@ def _extent_in_angle(observer: Observer, card: Card, half_pixel: float, half_str
     for views, pixels, elements in _blocks(observer.views, t.size, strips.size):
         part, sources = replace(observer, view_angles=observer.view_angles[views]), strips[elements]
         across = wall_points(part, t[pixels, None] + half_pixel * parts)[..., None]
-        u = outgoing_angles(part, across) + incident_angles(sources, card.distance, across)
+        theta_o = outgoing_angles(part, across)
+        u = theta_o + incident_angles(sources, card.distance, across)
         pixel = max(pixel, _PARTS * float(np.abs(np.diff(u, axis=2)).max()))
-        centre = across[:, :, _PARTS // 2]
+        turn = _PARTS * float(np.abs(np.diff(theta_o, axis=2)).max())
+        left, centre, right = (across[:, :, k] for k in (0, _PARTS // 2, _PARTS))
+        pixel = max(pixel, turn + float(_fastest(sources - left, sources - right, card.distance).max()))
+        strip = max(
+            strip, float(_fastest(sources + half_strip - centre, sources - half_strip - centre, card.distance).max())
+        )
         ends = (incident_angles(sources + half_strip * node, card.distance, centre) for node in parts)
         strip = max(strip, _PARTS * max(float((right - left).max()) for left, right in itertools.pairwise(ends)))
     return pixel, strip
+
+
+def _fastest(one: Array, two: Array, distance: float) -> Array:
+    """What atan(x / z) would span between x = one and two if it rose everywhere as fast as where it is steepest."""
+    nearest = np.where(one * two > 0, np.minimum(np.abs(one), np.abs(two)), 0.0) / distance
+    fastest: Array = np.abs(one - two) / distance / (1 + nearest * nearest)
+    return fastest
 
 
 def _blocks(views: int, pixels: int, elements: int) -> Iterator[tuple[slice, slice, slice]]:

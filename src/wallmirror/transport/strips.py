@@ -5,7 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from wallmirror.errors import InputError
 from wallmirror.geometry import Array
+
+#: atan x - x / (1 + x^2) = x^3 (2/3 - 4/5 x^2 + 6/7 x^4 ..).
+_BEND = tuple((-1) ** k * (2 * k + 2) / (2 * k + 3) for k in range(14))
 
 
 def strip_factor(distance: float, dx: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:
@@ -20,22 +24,40 @@ def strip_factor(distance: float, dx: ArrayLike, low: ArrayLike, high: ArrayLike
     low, high:
         Ends of the strip above the wall point, in metres.
 
+    Raises
+    ------
+    InputError
+        For a distance that is not positive, or values that are not finite.
+
     Notes
     -----
     The integrand is z^2 / (a^2 + h^2)^2 with a^2 = z^2 + dx^2; its antiderivative is
-    z^2 [h / (2 a^2 (a^2 + h^2)) + atan(h / a) / (2 a^3)].
+    z^2 [h / (2 a^2 (a^2 + h^2)) + atan(h / a) / (2 a^3)]. For a strip on one side of the wall point its values at both ends
+    nearly cancel. With heights in units of a, p their product and x = (h2 - h1) / (1 + p) the difference is then taken as
+
+        z^2 / (2 a^3) [(atan x - x / (1 + x^2)) + 2 x / ((1 + p)(1 + x^2))].
     """
-    a = np.hypot(distance, np.asarray(dx, dtype=np.float64))
+    dx, low, high = (np.asarray(value, dtype=np.float64) for value in (dx, low, high))
+    if not (0 < distance < np.inf and all(np.all(np.isfinite(value)) for value in (dx, low, high))):
+        raise InputError("or an offset or height is not finite, or it is not > 0", field="distance")
+    a = np.hypot(distance, dx)
 
-    def antiderivative(h: ArrayLike) -> Array:
+    def antiderivative(h: Array) -> Array:
         # In units of a, so that neither tiny nor huge scenes leave the range of float64.
-        h = np.asarray(h, dtype=np.float64) / a
+        h = h / a
         far = np.abs(h) > 1e8  # h / (1 + h^2) is 1 / h to rounding, and h^2 may overflow
-        ratio = np.where(far, 1 / np.where(far, h, 1.0), h / (1 + np.where(far, 0.0, h) ** 2))
-        whole: Array = 0.5 * (distance / a) ** 2 / a * (ratio + np.arctan(h))
-        return whole
+        ratio: Array = np.where(far, 1 / np.where(far, h, 1.0), h / (1 + np.where(far, 0.0, h) ** 2))
+        return ratio + np.arctan(h)
 
-    return antiderivative(high) - antiderivative(low)
+    with np.errstate(over="ignore"):
+        product = np.maximum((low / a) * (high / a), 0.0)
+    x = (high - low) / a / (1 + product)
+    small = np.minimum(np.abs(x), 0.25)
+    series = small**3 * np.polynomial.polynomial.polyval(small**2, _BEND)
+    bend = np.where(np.abs(x) <= 0.25, np.copysign(series, x), np.arctan(x) - x / (1 + x * x))
+    one_side = bend + 2 * x / (1 + product) / (1 + x * x)
+    value = np.where(product > 0, one_side, antiderivative(high) - antiderivative(low))
+    return np.asarray(0.5 * (distance / a) ** 2 / a * value, dtype=np.float64)
 
 
 def mean_strip_factor(distance: float, slope: Array, half: float, reach: Array | None) -> Array:

@@ -1,0 +1,185 @@
+"""The climb over knot spacings: from one on to finer ones while these pay, or down to coarser ones while these do.
+
+Whether knots pay is told without a fit on them where a fit would be dear (`finer`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from wallmirror.derendering.estimate import scale_free_error
+from wallmirror.derendering.finer import Films, Finer, loss, score, worth
+from wallmirror.derendering.information import information
+from wallmirror.derendering.ladder import ROUGH, Ladder
+from wallmirror.derendering.likelihood import Fit, maximise
+from wallmirror.errors import UndeterminedError
+
+Array = NDArray[np.float64]
+Tell = Callable[[str], None]
+
+# Share of a tolerance below which a move of the pattern is none.
+_SETTLED = 0.25
+# So many times more than noise explains must coarser knots lose by a quadratic guess for no fit to be tried on them.
+_HOPELESS = 10.0
+# Share of the data that finer knots must leave over.
+_SPARE = 0.25
+# Share of the BRDF's largest coefficient above which one is lit, of the best-seen one's information above which that one
+# counts, and of lit coefficients up to which rho is sparse.
+_LIT = 0.01
+_WELL_SEEN = 1e-3
+_SPARSE = 0.5
+
+
+@dataclass(frozen=True)
+class Other:
+    """Pattern (M, B) and misfit on knots beside the chosen ones."""
+
+    source: Array
+    objective: float
+
+
+def climb(
+    ladder: Ladder, begin: int, nonnegative: bool, tolerance: float | None, tell: Tell
+) -> tuple[dict[int, Fit], Other | None]:
+    """The free fits on the knots taken, by index, and what finer ones that were not would make of the last."""
+
+    def fit(index: int, *starts: Array) -> Fit:
+        found = maximise(ladder.summed(index), *starts, nonnegative=False, tolerance=ROUGH)
+        tell(f"knots every {math.degrees(ladder.grids[index].step):g} deg: misfit {found.objective:.6g}")
+        return found
+
+    index = begin
+    best = fit(index, ladder.closed(index).coefficients)
+    rival: Other | None = None
+    while index > 0 and not _needed(ladder, index, best, tell):  # coarser ones may do
+        coarser = fit(index - 1, ladder.coarsened(index, best.coefficients))
+        freedom = ladder.freedom(index)
+        fewer = ladder.seen(index) - ladder.seen(index - 1)
+        if coarser.objective - best.objective >= worth(fewer, freedom) * ladder.variance(best.objective, freedom):
+            break
+        rival = Other(best.source, best.objective)
+        index, best = index - 1, coarser
+    fits = {index: best}
+    if rival is not None:
+        return fits, rival
+    idle = 0
+    for finer in range(index + 1, ladder.last + 1):
+        if ladder.spare(finer) < _SPARE:
+            break  # nearly as many coefficients as data follow whatever the model misses
+        try:
+            trial, other = _finer(ladder, index, best, finer, nonnegative, fit, tell)
+        except UndeterminedError:
+            break  # so fine a grid has cells that nothing determines
+        if trial is not None:
+            moved = scale_free_error(best.source, trial.source)
+            index, best, rival, idle = finer, trial, None, 0
+            fits[index] = best
+            if tolerance is not None and _at_the_noise(ladder, index, best) and moved <= _SETTLED * tolerance:
+                tell(f"the pattern moved by {moved:.1e} only: knots are fine enough for {tolerance:g}")
+                break
+            continue
+        rival = rival or other
+        # One idle halving ends the search, unless the noise is known and not yet reached.
+        idle += 1
+        if idle == 2 or not ladder.problem.noise_is_stated or _at_the_noise(ladder, index, best):
+            break
+    return fits, rival
+
+
+def _needed(ladder: Ladder, index: int, fit: Fit, tell: Tell) -> bool:
+    """Whether coarser knots than a fit's would miss so much more than noise does that no fit on them is called for."""
+    summed, halved = ladder.summed(index), ladder.grids[index - 1].in_halved()
+    schur = information(summed, fit.coefficients, fit.source, fit.schur).schur
+    pull = np.einsum("ib,bik->k", fit.source, summed.cross)[summed.seen]
+    lost = loss(schur, fit.coefficients[summed.seen], pull, sp.csr_array(halved[summed.seen]))
+    freedom = ladder.freedom(index)
+    if lost < _HOPELESS * worth(ladder.seen(index), freedom) * ladder.variance(fit.objective, freedom):
+        return False
+    tell(f"knots every {math.degrees(ladder.grids[index - 1].step):g} deg would raise it by about {lost:.4g}")
+    return True
+
+
+def _at_the_noise(ladder: Ladder, index: int, fit: Fit) -> bool:
+    """Whether the misfit is what the stated noise makes."""
+    observations = ladder.summed(index).observations
+    return ladder.problem.noise_is_stated and fit.objective < observations + 4 * math.sqrt(2 * observations)
+
+
+def _finer(
+    ladder: Ladder, index: int, best: Fit, finer: int, nonnegative: bool, fit: Callable[..., Fit], tell: Tell
+) -> tuple[Fit | None, Other]:
+    """The fit on finer knots if these pay, and what they would make of the best one so far.
+
+    Where rho >= 0 leaves most of the angles dark, it is enough if finer knots pay in the lit ones, where their error lies.
+    """
+    start = ladder.refined(index, best.coefficients, finer)
+    if finer < ladder.last - 1:  # coarse still: to try is no dearer than to tell
+        return _paying(ladder, index, best, finer, fit(finer, start))
+    every = np.ones(start.size, dtype=bool)
+    found, price = _tested(ladder, index, best, finer, every, ladder.seen(index), tell)
+    if found.gain >= price:
+        return _paying(ladder, index, best, finer, fit(finer, start + found.step, start))
+    if nonnegative:
+        within = ladder.bounded(index, best)
+        lit = within.coefficients > _LIT * float(
+            np.max(within.coefficients[ladder.summed(index).exposure > _WELL_SEEN])
+        )
+        free = ladder.refined(index, lit.astype(np.float64), finer) > 0
+        if np.count_nonzero(free) < _SPARSE * free.size:
+            of_lit, its_price = _tested(ladder, index, within, finer, free, int(np.count_nonzero(lit)), tell)
+            if of_lit.gain >= its_price:
+                trial = fit(finer, start + found.step, start)
+                return trial, Other(trial.source, trial.objective)
+    return None, _stepped(ladder, finer, start + found.step)
+
+
+def _paying(ladder: Ladder, index: int, best: Fit, finer: int, trial: Fit) -> tuple[Fit | None, Other]:
+    """The fit on finer knots if it explains more than noise would let it."""
+    freedom = ladder.freedom(finer)
+    price = worth(ladder.seen(finer) - ladder.seen(index), freedom) * ladder.variance(trial.objective, freedom)
+    return (trial if best.objective - trial.objective >= price else None), Other(trial.source, trial.objective)
+
+
+def _tested(
+    ladder: Ladder, index: int, fit: Fit, finer: int, free: NDArray[np.bool_], used: int, tell: Tell
+) -> tuple[Finer, float]:
+    """What finer knots gain and what they must, for coefficients that are free to move where `used` of the coarser were."""
+    problem = ladder.problem
+    transport = np.stack([t @ fit.coefficients for t in ladder.designs(index)], axis=1)
+    films = Films(problem.data, problem.fit_weights, transport, fit.source)
+    freedom = ladder.freedom(index) - used
+    enough = worth(int(np.count_nonzero(free)), freedom) * ladder.variance(fit.objective, freedom)
+
+    def price_of(moving: int, gain: float) -> float:
+        return worth(max(1, moving - used), freedom) * ladder.variance(fit.objective - gain, freedom)
+
+    found = score(
+        films,
+        ladder.designs(finer),
+        ladder.band(finer),
+        free,
+        enough=enough,
+        # From the maximum a search finds less with each step; from a fit that bounds hold elsewhere it may find most late.
+        least=(lambda moving: price_of(moving, enough)) if np.all(free) else None,
+    )
+    price = price_of(found.free, found.gain)
+    tell(
+        f"knots every {math.degrees(ladder.grids[finer].step):g} deg would lower it by {found.gain:.4g}"
+        + ("" if np.all(free) else f" with {found.free} lit coefficients")
+        + f", noise by up to {price:.4g}"
+    )
+    return found, price
+
+
+def _stepped(ladder: Ladder, index: int, r: Array) -> Other:
+    """Pattern and misfit at given coefficients, without a fit."""
+    transport = np.stack([t @ r for t in ladder.designs(index)], axis=1)
+    films = Films(ladder.problem.data, ladder.problem.fit_weights, transport, np.zeros((transport.shape[1], 1)))
+    source = films.solved(films.data)
+    return Other(source, Films(films.data, films.weights, transport, source).objective())

@@ -1,0 +1,152 @@
+"""Sums over pixels by dense products: rows that look at nearly the same columns share a small dense block.
+
+A row of T_i is a run of few neighbouring columns (`splines`). Sorted by where their runs begin, a few dozen rows together
+look through a window of a few columns more in each T_i, as the wall's points lie on one line and all angle sums grow along
+it. Products of such blocks take matrices over the pixels to matrices over the coefficients faster than sparse ones do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+from wallmirror.derendering.subspace import run_length
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+# Rows of a block at most, columns that the begins of its runs may be spread over, and how many times the rows blocks may hold.
+_ROWS = 32
+_SPREAD = 4
+_EMPTY = 4
+
+
+@dataclass(frozen=True)
+class Windows:
+    """T_1 .. T_M cut into dense blocks.
+
+    Parameters
+    ----------
+    blocks:
+        Shape (n, c, M, W): of each of n blocks c rows, seen through windows of W columns; rows that are none are 0.
+    begin:
+        First column of each window, shape (n, M).
+    slot:
+        Place of each row among the n c, shape (P,).
+    size:
+        K.
+    """
+
+    blocks: Array
+    begin: Indices
+    slot: Indices
+    size: int
+
+    @classmethod
+    def of(cls, designs: list[sp.csr_array]) -> Windows | None:
+        """The blocks of matrices whose rows are runs, each matrix's of one length; None for others."""
+        lengths = [run_length(t) for t in designs]
+        if 0 in lengths:
+            return None
+        rows, size = designs[0].shape
+        longest = max(lengths)
+        runs = np.stack([t.indices[::length] for t, length in zip(designs, lengths, strict=True)]).astype(np.intp)
+        order = np.argsort(runs.sum(axis=0), kind="stable")
+        cuts = _cuts(runs[:, order])
+        block = np.repeat(np.arange(cuts.size), np.diff(cuts, append=rows))
+        height = int(np.diff(cuts, append=rows).max())
+        slot = np.empty(rows, dtype=np.intp)
+        slot[order] = block * height + np.arange(rows) - cuts[block]
+        first, last = _range(runs[:, order], cuts)
+        width = min(size, longest + int((last - first).max()))
+        first = np.minimum(first, size - width)
+        blocks = np.zeros((cuts.size, height, len(designs), width))
+        # One row after the other in a line, each run is a piece of it.
+        line = blocks.reshape(-1)
+        for i, (t, length) in enumerate(zip(designs, lengths, strict=True)):
+            place = (slot * len(designs) + i) * width + runs[i] - first[i, slot // height]
+            sliding_window_view(line, length, writeable=True)[place] = t.data.reshape(rows, length)
+        return cls(blocks, np.ascontiguousarray(first.T), slot, size)
+
+    def cut(self, films: Array) -> Array:
+        """Columns over the pixels (P, n') in the blocks' order, (n, c, n')."""
+        count, height = self.blocks.shape[:2]
+        placed = np.zeros((count * height, films.shape[1]))
+        placed[self.slot] = films
+        return placed.reshape(count, height, -1)
+
+    def most_entries(self) -> int:
+        """Entries that `grams` will find at most, without a look at a value: rows of N_ij reach as far as the windows of j do
+        where those of i cover the row."""
+        width, elements = self.blocks.shape[3], self.begin.shape[1]
+        total = 0
+        for i in range(elements):
+            low = np.full((self.size, elements - i), self.size)
+            high = np.full((self.size, elements - i), -1)
+            np.minimum.at(low, self.begin[:, i], self.begin[:, i:])
+            np.maximum.at(high, self.begin[:, i], self.begin[:, i:])
+            # A row lies in windows that begin up to a width before it.
+            low = minimum_filter1d(low, width, axis=0, origin=(width - 1) // 2, mode="constant", cval=self.size)
+            high = maximum_filter1d(high, width, axis=0, origin=(width - 1) // 2, mode="constant", cval=-1)
+            total += int(np.sum((high - low + width)[high >= low]))
+        return total
+
+    def grams(self, weight: Array) -> tuple[NDArray[np.intp], Indices, Array]:
+        """N_ij = T_i^T W T_j for i <= j, in the order (0, 0), (0, 1), ..., (0, M - 1), (1, 1), ...
+
+        Returns
+        -------
+        Of the stack of all these (K, K) matrices: the entries of each row, shape (M (M + 1) / 2 K,), and column and value of
+        the entries that are not 0, row by row.
+        """
+        count, height, elements, width = self.blocks.shape
+        weights = self.cut(weight[:, None])
+        ahead = np.arange(width)
+        found = []
+        for i in range(elements):
+            left = (weights * self.blocks[:, :, i]).transpose(0, 2, 1)
+            right = self.blocks[:, :, i:].reshape(count, height, -1)
+            product = (left @ right).reshape(count, width, elements - i, width)
+            # Rows of N_ij reach from `low` on, over `reach` columns at most: that small table sums the blocks up.
+            row = (self.begin[:, i, None] + ahead)[:, :, None] + self.size * np.arange(elements - i)
+            begin = np.broadcast_to(self.begin[:, None, i:], row.shape)
+            low = np.full(self.size * (elements - i), self.size)
+            np.minimum.at(low, row.ravel(), begin.ravel())
+            beyond = begin - low[row]
+            reach = int(np.max(beyond)) + width
+            place = (row * reach + beyond)[..., None] + ahead
+            table = np.bincount(place.ravel(), weights=product.ravel(), minlength=low.size * reach)
+            filled = table != 0
+            entries = np.count_nonzero(filled.reshape(-1, reach), axis=1)
+            column = np.flatnonzero(filled) + np.repeat(low - reach * np.arange(low.size), entries)
+            found.append((entries, column, table[filled]))
+        entries, columns, values = (np.concatenate(part) for part in zip(*found, strict=True))
+        return entries, columns, values
+
+
+def _cuts(runs: Indices) -> Indices:
+    """Where blocks begin in sorted rows: every few dozen rows, and in their midst where their runs are spread too far."""
+    rows = runs.shape[1]
+    height = _ROWS
+    while True:
+        cuts = np.arange(0, rows, height)
+        while True:
+            first, last = _range(runs, cuts)
+            sizes = np.diff(cuts, append=rows)
+            torn = np.any(last - first > _SPREAD, axis=0) & (sizes > 1)
+            if not np.any(torn):
+                break
+            cuts = np.sort(np.concatenate([cuts, cuts[torn] + sizes[torn] // 2]))
+        if height == 1 or cuts.size * height <= _EMPTY * rows:
+            return cuts
+        height //= _EMPTY
+
+
+def _range(runs: Indices, cuts: Indices) -> tuple[Indices, Indices]:
+    """First and last begin of the runs of each block, (M, n) each."""
+    return np.minimum.reduceat(runs, cuts, axis=1), np.maximum.reduceat(runs, cuts, axis=1)

@@ -1,0 +1,1 @@
+"""The cells of the table of extremes, one module for each topic."""
