@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.finer import Films, Finer, loss, score, worth
 from wallmirror.derendering.information import information
-from wallmirror.derendering.ladder import ROUGH, Ladder
+from wallmirror.derendering.ladder import ROUGH, SPARE, Ladder
 from wallmirror.derendering.likelihood import Fit, maximise
 from wallmirror.errors import UndeterminedError
 
@@ -27,8 +27,6 @@ Tell = Callable[[str], None]
 _SETTLED = 0.25
 # So many times more than noise explains must coarser knots lose by a quadratic guess for no fit to be tried on them.
 _HOPELESS = 10.0
-# Share of the data that finer knots must leave over.
-_SPARE = 0.25
 # Share of the BRDF's largest coefficient above which one is lit, of the best-seen one's information above which that one
 # counts, and of lit coefficients up to which rho is sparse.
 _LIT = 0.01
@@ -57,11 +55,13 @@ def climb(
     index = begin
     best = fit(index, ladder.closed(index).coefficients)
     rival: Other | None = None
+    finer_fits: dict[int, Fit] = {}
     while index > 0 and not _needed(ladder, index, best, tell):  # coarser ones may do
+        finer_fits[index] = best
         coarser = fit(index - 1, ladder.coarsened(index, best.coefficients))
-        freedom = ladder.freedom(index)
-        fewer = ladder.seen(index) - ladder.seen(index - 1)
-        if coarser.objective - best.objective >= worth(fewer, freedom) * ladder.variance(best.objective, freedom):
+        # Against each of the finer ones: steps of which none loses much may lose much together.
+        losses = ((finer, each, coarser.objective - each.objective) for finer, each in finer_fits.items())
+        if any(loss >= ladder.price(index - 1, finer, each) for finer, each, loss in losses):
             break
         rival = Other(best.source, best.objective)
         index, best = index - 1, coarser
@@ -70,7 +70,7 @@ def climb(
         return fits, rival
     idle = 0
     for finer in range(index + 1, ladder.last + 1):
-        if ladder.spare(finer) < _SPARE:
+        if ladder.spare(finer) < SPARE:
             break  # nearly as many coefficients as data follow whatever the model misses
         try:
             trial, other = _finer(ladder, index, best, finer, nonnegative, fit, tell)
@@ -141,8 +141,7 @@ def _finer(
 
 def _paying(ladder: Ladder, index: int, best: Fit, finer: int, trial: Fit) -> tuple[Fit | None, Other]:
     """The fit on finer knots if it explains more than noise would let it."""
-    freedom = ladder.freedom(finer)
-    price = worth(ladder.seen(finer) - ladder.seen(index), freedom) * ladder.variance(trial.objective, freedom)
+    price = ladder.price(index, finer, trial)
     return (trial if best.objective - trial.objective >= price else None), Other(trial.source, trial.objective)
 
 

@@ -49,6 +49,8 @@ class Level:
         The maxima of the likelihood without bounds and with those that were asked for.
     groups:
         Of elements that share no coefficient; the fit has each in a scale of its own.
+    strained:
+        Whether the bounds cost the fit more than noise explains.
     """
 
     grid: SplineGrid
@@ -58,6 +60,7 @@ class Level:
     free: Fit
     fit: Fit
     groups: Groups
+    strained: bool
 
     @property
     def parameters(self) -> int:
@@ -162,7 +165,8 @@ def _level(ladder: Ladder, index: int, free: Fit, nonnegative: bool) -> Level | 
     grid, groups = ladder.grids[index], ladder.groups(index)
     if len(groups) > 1:
         fit = groups.scaled(fit, grid, summed.exposure)
-    level = Level(grid, ladder.designs(index), summed, ladder.closed(index), free, fit, groups)
+    strained = nonnegative and not ladder.agrees(index, free, fit)
+    level = Level(grid, ladder.designs(index), summed, ladder.closed(index), free, fit, groups, strained)
     return level if math.isfinite(level.bound.source_error) else None
 
 

@@ -20,12 +20,15 @@ from wallmirror.derendering.moments import Moments, moments
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import SplineGrid, design_matrices
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, banded_gram, closed_form
+from wallmirror.errors import UndeterminedError
 from wallmirror.transport import Kernel
 
 Array = NDArray[np.float64]
 
 #: Between knots the fits need not be finer than this share of the misfit.
 ROUGH = 1e-5
+#: Share of the data that finer knots must leave over.
+SPARE = 0.25
 # That of the closed form: splines of degree 3 need knots half as far apart for lobes of the same width.
 _DEGREE = 7
 # Quadrature of the fit, of a lobe's peak.
@@ -135,10 +138,14 @@ class Ladder:
         return self._bounded[index]
 
     def agrees(self, index: int, free: Fit, bounded: Fit) -> bool:
-        """Whether the bounds cost what they do where the truth keeps them: about one unit of noise a coefficient, not more."""
-        summed = self.summed(index)
-        noise = free.objective / max(1, summed.observations - summed.size)
-        return bounded.objective <= free.objective + 3 * summed.size * noise
+        """Whether the bounds cost no more than noise makes of them where the truth keeps them.
+
+        That is a mixture of chi-squared laws with as many degrees of freedom as bounds hold, at most all coefficients and
+        patterns, for which it is taken here: four standard deviations above its mean.
+        """
+        bounds = self.seen(index) + bounded.source.size
+        noise = free.objective / max(1, self.freedom(index))
+        return bounded.objective <= free.objective + (bounds + 4 * math.sqrt(2 * bounds)) * noise
 
     def _from_coarser(self, index: int) -> Array:
         """The closed form's r on the coarsest knots, and on finer ones the maximum within the bounds of the coarser."""
@@ -150,23 +157,41 @@ class Ladder:
         return self.refined(index - 1, self.bounded(index - 1, self._free[index - 1]).coefficients, index)
 
     def as_fine_as_the_bounds_want(self, index: int, free: Fit) -> tuple[int, Fit]:
-        """These knots, or coarser ones with which the bounded fit is as good.
+        """These knots, or the finer or coarser ones that bounded fits ask for.
 
-        Light that the model does not know is followed by free fits on fine knots, with a rho below zero. Bounds do not
-        follow it, and then finer knots have nothing to say for themselves.
+        Finer ones, where free fits swing below zero around lobes that the knots are too coarse for: bounds allow no such
+        swings. Coarser ones, where light that the model does not know is followed by free fits on fine knots with a rho below
+        zero: bounds do not follow it, and then finer knots have nothing to say for themselves.
         """
+        while (
+            index < self.last
+            and self.spare(index + 1) >= SPARE
+            and not self.agrees(index, free, self.bounded(index, free))
+        ):
+            try:
+                start = self.refined(index, free.coefficients, index + 1)
+                finer = maximise(self.summed(index + 1), start, nonnegative=False, tolerance=ROUGH)
+                gain = self.bounded(index, free).objective - self.bounded(index + 1, finer).objective
+            except UndeterminedError:
+                break
+            if gain < self.price(index, index + 1, finer):
+                break
+            index, free = index + 1, finer
         while index > 0:
             fit = self.bounded(index, free)
             if self.agrees(index, free, fit):
                 break
             self._from_coarser(index)
             coarser = self.bounded(index - 1, self._free[index - 1])
-            freedom = self.freedom(index)
-            price = worth(self.seen(index) - self.seen(index - 1), freedom) * self.variance(fit.objective, freedom)
-            if coarser.objective - fit.objective >= price:
+            if coarser.objective - fit.objective >= self.price(index - 1, index, fit):
                 break
             index, free = index - 1, self._free[index - 1]
         return index, free
+
+    def price(self, index: int, finer: int, fit: Fit) -> float:
+        """What a fit on finer knots must gain on coarser ones, or noise alone may make the difference."""
+        freedom = self.freedom(finer)
+        return worth(self.seen(finer) - self.seen(index), freedom) * self.variance(fit.objective, freedom)
 
     def seen(self, index: int) -> int:
         """How many coefficients the captures see."""

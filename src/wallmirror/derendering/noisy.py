@@ -76,6 +76,11 @@ def solve_noisy(
                 "far the pattern moved when the knots were last halved"
             )
     warnings += doubts_of_fit(converged=fit.converged, misfit=reduced if stated else None)
+    if level.strained:
+        warnings.append(
+            "to keep BRDF and pattern >= 0 costs more misfit than noise explains, so the knots are too coarse or the model "
+            "(one bounce, angle-sum BRDF, geometry) does not hold, and the error bars may be too small"
+        )
     if rival is not None:
         moved = scale_free_error(rival.source, level.free.source, apart)
         if moved > _STEADY * predicted:
