@@ -19,7 +19,9 @@ from wallmirror.derendering.estimate import Estimate, scale_free_error
 from wallmirror.derendering.exact import solve_exactly
 from wallmirror.derendering.facet_fit import settle_wall
 from wallmirror.derendering.facets import FITTED, weighted
+from wallmirror.derendering.noisy import solve_noisy
 from wallmirror.derendering.problem import Problem, prepare
+from wallmirror.derendering.solution import Gauge, conclude
 from wallmirror.derendering.solve import solve
 from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card, Observer, scan_angles
@@ -160,12 +162,15 @@ def test_a_turn_that_is_open_is_told_where_it_rules_the_bars_and_matters() -> No
 
 
 def test_a_fit_to_captures_without_noise_does_not_vouch_for_its_bars() -> None:
-    # Far away two elements see the same angles, so that the closed form has no bound to offer and the fit is left.
-    captures, _ = filmed(FAR, replace(FACETS, alpha=0.44), 3)
-    fitted = solve(captures)
-    assert fitted.method == "maximum_likelihood"
-    assert fitted.verdict == "doubtful"
-    assert any("free of noise" in warning for warning in fitted.warnings)
+    problem, space = prepare(filmed(OPEN, FACETS, 6)[0])
+    fitted = solve_noisy(problem, space, (2.0,))
+
+    def doubts(quiet: bool) -> str:
+        judged = conclude(problem, space, fitted, None, None, gauge=Gauge(), quiet=quiet, seconds=lambda: 0.0)
+        return " ".join(judged.warnings)
+
+    assert "free of noise" in doubts(True)
+    assert "free of noise" not in doubts(False)
 
 
 # -- few captures ----------------------------------------------------------------------------------------------
