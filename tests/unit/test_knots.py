@@ -14,7 +14,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
+from wallmirror.brdf import GaussianTrain
 from wallmirror.captures import CaptureSet
+from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.finer import Films, Finer, loss, score, worth
 from wallmirror.derendering.information import information
 from wallmirror.derendering.likelihood import Fit, maximise, moments
@@ -221,3 +223,35 @@ def test_knots_follow_the_noise_and_the_lobes() -> None:
     steps = step(5, 0), step(5, 60), step(2, 0)
     assert steps[1] < steps[0]
     assert steps[2] < steps[0]
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_bounds_ask_for_finer_knots_where_free_fits_swing_below_zero(seed: int) -> None:
+    # Lobes of 2.7 deg at 10 dB: free splines on knots of 4 deg follow them by swings below zero beside each, splines >= 0
+    # cannot.
+    card = Card(elements_x=(-0.6, 0.6), y=-2.7)
+    brdf = GaussianTrain(centres=tuple(np.radians([7.0, 37.0, -19.0, 11.0])), sigma=math.radians(2.7))
+    rng = np.random.default_rng(seed)
+    source = rng.random((2, 6))
+    films = radiance(transport_matrix(thesis_observer(154, 3), card, brdf, weights="cosine"), source)
+    sigma = 0.32 * float(np.sqrt(np.mean(films**2)))
+    captures = CaptureSet(
+        observer=thesis_observer(154, 3),
+        card=card,
+        transport="cosine",
+        radiance=films + sigma * rng.standard_normal(films.shape),
+        variance=np.full(films.shape, sigma**2),
+    )
+    free, coarse, chosen = (
+        solve(captures, step_deg=4.0, nonnegative=False),
+        solve(captures, step_deg=4.0),
+        solve(captures),
+    )
+    for sound in (free, chosen):
+        assert sound.verdict == "good"
+        assert scale_free_error(sound.source, source) < 3 * sound.predicted_error
+    assert chosen.step_deg < 4.0
+    # Where the knots are given, the answer says what is wrong; called good it would be a confident wrong one.
+    assert coarse.verdict == "doubtful"
+    assert "costs more misfit than noise explains" in coarse.status
+    assert scale_free_error(coarse.source, source) > 4 * coarse.predicted_error

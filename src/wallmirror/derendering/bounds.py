@@ -122,12 +122,15 @@ def bound_of(
     # A null direction of S for each scale that is free: the group's part of r.
     null = r[None] if groups is None else np.where(groups.cells[:, seen], r, 0.0)
     patterns = source.T[None] if groups is None else np.stack([_only(source, each).T for each in groups.elements])
-    strength = float(np.trace(schur)) / max(1, schur.shape[0]) / max(float(np.sum(c * c)), 1e-300) * len(c)
+    # Where rounding is all there is, the trace may be negative.
+    level = float(np.trace(schur)) / max(1, schur.shape[0])
+    informed, level = level > 0, level if level > 0 else float(np.max(np.abs(schur), initial=0.0)) or 1.0
+    strength = level / max(float(np.sum(c * c)), 1e-300) * len(c)
     pinned = schur + strength * c.T @ c
     # Barely seen cells: a ridge far below their neighbours' information keeps their (huge) variance finite.
     # And no ridge below the rounding of S, which subtracts C^T H^-1 C with the condition of H.
     lost = max(1e-12, 4 * np.finfo(np.float64).eps * float(np.max(np.linalg.cond(inverse))))
-    ridge = lost * float(np.trace(schur)) / max(1, schur.shape[0])
+    ridge = lost * level
     along = np.sum(c * null, axis=1, keepdims=True)
     scale = np.divide(null, math.sqrt(strength) * along, out=np.zeros_like(null), where=along != 0)
     rows = coupled.reshape(-1, r.size)
@@ -137,7 +140,7 @@ def bound_of(
         raised[np.diag_indices_from(raised)] += ridge
         return np.asarray(sl.cholesky(raised, lower=True, overwrite_a=True, check_finite=False))
 
-    lower, sound = None, lost <= 1e-3
+    lower, sound = None, informed and lost <= 1e-3
     while lower is None:
         try:
             lower = factor(ridge)
@@ -149,7 +152,8 @@ def bound_of(
     # What the ridge alone holds, nothing holds: a bound on V that falls with it is none. It is convex in the ridge, so that
     # its slope tells how far it may fall at most.
     whole = spread.reshape(rows.shape) + (rows @ scale.T) @ scale  # [H^-1 C] of the pinned information's inverse
-    most = 9 * ridge * float(np.sum(whole * whole)) / max(float(np.sum(source * source)), 1e-300)
+    whole *= math.sqrt(ridge)  # before the square, which may leave the range of float64
+    most = 9 * float(np.sum(whole * whole)) / max(float(np.sum(source * source)), 1e-300)
     if sound and not error**2 - most >= (_KEPT * error) ** 2:
         solved = sl.cho_solve((factor(10 * ridge), True), rows.T, check_finite=False).T - (rows @ scale.T) @ scale
         sound = _scale_free_error(patterns, inverse, coupled, solved.reshape(coupled.shape)) >= _KEPT * error

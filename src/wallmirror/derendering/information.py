@@ -21,6 +21,8 @@ from wallmirror.errors import UndeterminedError
 
 Array = NDArray[np.float64]
 
+_LEAST = float(np.finfo(np.float64).tiny)
+
 
 @dataclass(frozen=True)
 class Point:
@@ -121,11 +123,11 @@ def inverses(data: Moments, point: Point, free: NDArray[np.bool_]) -> Array:
     if not np.all(trace > 0):
         raise unseen_pattern()
     ridge = 1e-14 * trace[:, None, None] * np.eye(m)
-    inverse = np.linalg.inv(point.normal + ridge + 1e-300 * np.eye(m))[data.group]
+    inverse = np.linalg.inv(point.normal + ridge)[data.group]
     for b in np.flatnonzero(~np.all(free, axis=1)):
         both = free[b, :, None] & free[b]
         normal = point.normal[data.group[b]]
-        kept = np.where(both, normal, np.eye(m) * np.trace(normal) + 1e-300)
+        kept = np.where(both, normal, np.eye(m) * np.trace(normal))
         inverse[b] = np.where(both, np.linalg.inv(kept + 1e-14 * np.trace(kept) * np.eye(m)), 0.0)
     return np.asarray(inverse)
 
@@ -145,7 +147,7 @@ def schur_complement(
         few = point.v[alike] if alike.size <= m else np.linalg.qr(point.v[alike], mode="r")
         coupling = (few @ pair.reshape(m, -1)).reshape(-1, m, data.size)[..., cells]
         values, vectors = np.linalg.eigh(point.normal[g])
-        root = vectors / np.sqrt(np.maximum(values, 1e-14 * np.sum(values)) + 1e-300)
+        root = vectors / np.sqrt(np.maximum(values, max(1e-14 * float(np.sum(values)), _LEAST)))
         half = (root.T @ coupling).reshape(-1, cells.size)
         schur -= half.T @ half
     bound = np.flatnonzero(~whole)
