@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 _PLATEAU = 10.0
 # The pattern may move by this many of its error bars when the knots are halved.
 _STEADY = 3.0
+# A move of the pattern that widens the error bars without a word.
+_SLIGHT = 1e-3
 
 
 def solve_noisy(
@@ -77,10 +79,16 @@ def solve_noisy(
             )
     warnings += doubts_of_fit(converged=fit.converged, misfit=reduced if stated else None)
     if level.strained:
-        warnings.append(
-            "to keep BRDF and pattern >= 0 costs more misfit than noise explains, so the knots are too coarse or the model "
-            "(one bounce, angle-sum BRDF, geometry) does not hold, and the error bars may be too small"
-        )
+        # What the bounds hold back turns the pattern by as much as they move it.
+        moved = scale_free_error(level.free.source, fit.source, apart)
+        if moved > max(_STEADY * predicted, _SLIGHT):
+            warnings.append(
+                f"to keep BRDF and pattern >= 0 costs more misfit than noise explains and moves the pattern by "
+                f"{100 * moved:.2g} %, so the knots are too coarse or the model (one bounce, angle-sum BRDF, geometry) does not "
+                "hold"
+            )
+        if moved > predicted:
+            shape_std, predicted = shape_std * (moved / predicted), moved
     if rival is not None:
         moved = scale_free_error(rival.source, level.free.source, apart)
         if moved > _STEADY * predicted:
