@@ -84,8 +84,8 @@ def solve_noisy(
         if moved > max(_STEADY * predicted, _SLIGHT):
             warnings.append(
                 f"to keep BRDF and pattern >= 0 costs more misfit than noise explains and moves the pattern by "
-                f"{100 * moved:.2g} %, so the knots are too coarse or the model (one bounce, angle-sum BRDF, geometry) does not "
-                "hold"
+                f"{100 * moved:.2g} %, so the knots are too coarse or the model (one bounce, angle-sum BRDF, geometry) does "
+                "not hold"
             )
         if moved > predicted:
             shape_std, predicted = shape_std * (moved / predicted), moved
