@@ -152,7 +152,8 @@ def test_an_angle_sum_wall_keeps_its_bars_and_its_solution_whatever_is_allowed()
     plain, auto = solve(captures, wall="angle_sum"), solve(captures, wall="auto")
     _, alone = fitted(captures)
     assert plain.verdict == auto.verdict == "good"
-    assert plain.predicted_error == alone.predicted_error
+    # Outside `solve` two threads may sum in another order.
+    assert plain.predicted_error == pytest.approx(alone.predicted_error, rel=1e-10)
     np.testing.assert_array_equal(plain.source, auto.source)
     assert auto.angle_sum_check is not None
     assert not auto.angle_sum_check.assumed

@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 # Variances below this share of the largest are raised to it: a pixel that saw no noise by luck must not outweigh
 # all others, and no spline follows a lobe's tail to better than about a hundredth of the noise at its peak.
 _VARIANCE_FLOOR = 1e-4
+#: Noise that would make no larger mismatch than this is rounding.
+ROUNDING = 1e-20
 # Variances in units of the brightest pixel's square: below the first there is only rounding, beyond the second no light.
 _SILENT, _DROWNED = 1e-32, 1e60
 # Standard deviations above which a radiance stands out of its noise; those that, over the brightest such, say as much as

@@ -16,7 +16,7 @@ from wallmirror.derendering.angle_sum_check import AngleSumCheck
 from wallmirror.derendering.components import components, in_words, named
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.one_bounce import OneBounceCheck
-from wallmirror.derendering.problem import Problem, expected_mismatch
+from wallmirror.derendering.problem import ROUNDING, Problem, expected_mismatch
 from wallmirror.derendering.subspace import SignalSpace
 from wallmirror.errors import InputError, UndeterminedError
 
@@ -273,6 +273,12 @@ def conclude(
             f"{closed.near_solutions} different BRDFs explain the captures equally well{tied}, gap {closed.gap:.1e}; use a "
             "card or views whose reflections share more angles"
         )
+    expected = expected_mismatch(problem, space, closed)
+    if len(groups) > 1 and estimate.method in FITS and not problem.noise_is_stated and expected < ROUNDING:
+        raise UndeterminedError(
+            f"{named(groups)} share no angle of the BRDF, and a fit to captures without noise cannot tell whether more than a "
+            "scale each is free; leave the method out, or use a card or views whose reflections share more angles"
+        )
     if not estimate.predicted_error <= UNDETERMINED:
         raise UndeterminedError(
             f"the captures leave the pattern undetermined (its error bars come to {100 * estimate.predicted_error:.0f} "
@@ -282,7 +288,6 @@ def conclude(
     views, pixels, _ = problem.captures.radiance.shape
     missed = np.linalg.norm(problem.data - estimate.transport @ estimate.source)
     warnings = list(estimate.warnings)
-    expected = expected_mismatch(problem, space, closed)
     if estimate.method in FITS and closed.mismatch > 10 * expected and closed.mismatch > 1e-6:
         warnings.append(
             f"the closed form misses the data's space by {closed.mismatch:.1e} where noise explains {expected:.1e}, so "

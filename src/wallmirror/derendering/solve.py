@@ -27,7 +27,7 @@ from wallmirror.derendering.knots import NOISY_STEPS
 from wallmirror.derendering.noisy import solve_noisy
 from wallmirror.derendering.one_bounce import check_one_bounce
 from wallmirror.derendering.placed import widened
-from wallmirror.derendering.problem import Problem, expected_mismatch, prepare
+from wallmirror.derendering.problem import ROUNDING, Problem, expected_mismatch, prepare
 from wallmirror.derendering.scarce import refit_scarce, solve_scarce
 from wallmirror.derendering.solution import UNDETERMINED, Gauge, Scale, Solution, conclude
 from wallmirror.derendering.subspace import SignalSpace
@@ -55,8 +55,6 @@ class SolveOptions(TypedDict, total=False):
 
 # Below this mismatch the data count as free of noise: float64 renders end near 1e-24, float32 files near 1e-13.
 _NOISELESS = 1e-15
-# Noise that would make no larger mismatch than this is rounding.
-_SILENT = 1e-20
 # Without noise the closed form is taken up to this error: a misfit that is no noise would give a likelihood false bars.
 _KNOWN = 0.1
 
@@ -206,7 +204,7 @@ def solve(
             # The singular values beyond M tell noise best: knots as fine as the pixels fit noise as well. Where there are
             # none beyond, a mismatch near rounding has to do.
             noise = expected_mismatch(problem, space, exact.closed)
-            quiet = exact.closed.mismatch < _NOISELESS if math.isnan(noise) else noise < _SILENT
+            quiet = exact.closed.mismatch < _NOISELESS if math.isnan(noise) else noise < ROUNDING
             held = problem
             if exact.closed.near_solutions == 1 and (quiet or method == "closed_form"):
                 held, exact, angle_sum = settle(problem, exact, closed, quietly, bounded=True)
