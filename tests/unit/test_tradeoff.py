@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -412,3 +413,40 @@ def test_the_thesiss_elements_are_put_in_order_before_they_are_judged() -> None:
     found = inverse._alternation(film.captures, film.source, 3, 1e-3)
     shuffled = scale_free_error(found[::-1], film.source)
     assert scale_free_error(found, film.source) <= shuffled
+
+
+def worker_of(monkeypatch: pytest.MonkeyPatch, bytes_a_pixel: float, *, guarded: bool = True) -> None:
+    """A worker that takes so many bytes a pixel, and refuses what is beyond its limit unless it is not guarded."""
+
+    def ask(spec: dict[str, Any], *, limit_gb: float | None = None) -> dict[str, Any]:
+        needed = bytes_a_pixel * spec["pixels"]
+        refused = guarded and limit_gb is not None and needed > 1e9 * limit_gb
+        failure = "memory: F needs 99 GB of memory and 16 GB are left" if refused else ""
+        taken = 0.0 if refused else needed
+        return {"seconds": 1e-6 * spec["pixels"], "wall": 0.0, "bytes": taken, "failure": failure}
+
+    monkeypatch.setattr(scaling, "ask", ask)
+
+
+def test_a_sweep_goes_on_to_the_largest_size_that_the_memory_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    sweep = scaling.SWEEPS[0]
+    worker_of(monkeypatch, 1000.0)  # 16 million pixels fit
+    quick = scaling._swept(sweep, 6.0, factor=2)
+    assert [run.knobs["pixels"] for run in quick[:3]] == [500, 1000, 2000]
+    filled = scaling._filled(sweep, quick)
+    done = [run.knobs["pixels"] for run in filled if not run.failure]
+    # Refused runs are kept, and the largest that was done lies within a third of the limit.
+    assert any(run.failure for run in filled)
+    assert 16e6 / 1.5 < max(done) <= 16e6
+    assert scaling._of_the_largest([*quick, *filled]).met is True
+    # The planted fault: a worker that takes more than it was given is told.
+    worker_of(monkeypatch, 1000.0, guarded=False)
+    beyond = scaling._run(sweep, 20_000_000, limit_gb=16.0)
+    assert scaling._of_the_largest([*quick, beyond]).met is False
+
+
+def test_full_sizes_are_for_the_panel_of_sizes(tmp_path: Path) -> None:
+    for names, quick in ((["forward"], False), (["scaling"], True)):
+        error = refused(lambda n=names, q=quick: trading.measure_tradeoffs(n, tmp_path, quick=q, full=True))
+        assert error.field == "full"
+    assert not list(tmp_path.iterdir())
