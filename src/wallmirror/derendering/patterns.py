@@ -26,7 +26,8 @@ from wallmirror.derendering.subspace import CERTAIN, LIKELY, noise_edge
 
 Array = NDArray[np.float64]
 
-# Standard deviation of a coefficient, as a share of the largest, from which it is free.
+# Standard deviation of a coefficient that the other elements leave it, as a share of the largest that a fit without bounds has,
+# from which it is free: beside a false pattern, which is faint, coefficients of its own grow large.
 _FREE = 0.3
 
 
@@ -67,9 +68,15 @@ def trusted_bound(
     certain = standing_out(strength / sigma, *size)
     if certain == elements:
         return bound
-    likely = standing_out(strength / sigma, *size, units=LIKELY)
+    # Bounds weaken patterns, false ones and true ones. What noise makes of one is known without them alone.
+    free = np.stack([t @ level.free.coefficients for t in level.designs], axis=1)
+    unbounded = np.linalg.svd(np.linalg.qr(problem.row_weights * free, mode="r") @ level.free.source, compute_uv=False)
+    certain = max(certain, standing_out(unbounded / sigma, *size))
+    likely = standing_out(unbounded / sigma, *size, units=LIKELY)
     if likely < elements:
         raise too_few_patterns(likely, elements)
+    if certain == elements:
+        return bound
     kept = np.linalg.lstsq(triangle, (left[:, :certain] * strength[:certain]) @ right[:certain], rcond=None)[0]
     wide = max(bound, bound_at(kept), key=lambda each: each.source_error)
     if not math.isfinite(wide.source_error):
@@ -101,5 +108,5 @@ def free_coefficients(problem: Problem, level: Level, source: Array, sigma: floa
     shown = np.stack([t.multiply(t).T @ weights for t in level.designs])  # (M, K)
     shown = shown * np.sum(source * source, axis=1)[:, None]
     by_others = (np.sum(shown, axis=0) - shown)[:, level.summed.seen]
-    peak = float(np.max(np.abs(level.fit.coefficients)))
-    return int(np.max(np.count_nonzero(by_others < (sigma / (_FREE * peak)) ** 2, axis=1)))
+    largest = float(np.max(np.abs(level.free.coefficients)))
+    return int(np.max(np.count_nonzero(by_others < (sigma / (_FREE * largest)) ** 2, axis=1)))
