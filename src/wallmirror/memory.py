@@ -27,6 +27,8 @@ _PICTURE_ARRAYS, _PATH_BYTES = 7, 64e6
 _FILM_ARRAYS = 6
 # A solution: films of the problem and of its fits, cubic splines and their dense windows, and what does not grow.
 _SOLUTION_ARRAYS, _ELEMENT_ARRAYS, _SOLUTION_BYTES = 8.5, 24, 20e6
+# Squares of the smaller side of the films that their singular values take, and of the columns of T_1 .. T_M together.
+_DECOMPOSED_SQUARES, _SPAN_SQUARES = 12, 3
 # Bytes of an entry of T_i^T W T_j while it is made and for as long as it is held; a bound on the entries is 1.4 times them.
 _ENTRY_MADE, _ENTRY_HELD = 36, 19
 # Beside degree + 1 basis functions at all nodes: their sums and places, and one element's share with the weight.
@@ -106,7 +108,13 @@ def design_bytes(views: int, pixels: int, elements: int, nodes: int, *, degree: 
 def solution_bytes(views: int, pixels: int, elements: int, realisations: int) -> float:
     """Peak of solving a capture set but for its pairs of elements (`pairs_bytes`): films, and matrices over the pixels."""
     per_pixel = _SOLUTION_ARRAYS * realisations + _ELEMENT_ARRAYS * elements
-    return float(_FLOAT) * views * pixels * per_pixel + _SOLUTION_BYTES
+    decomposed = _DECOMPOSED_SQUARES * float(min(views * pixels, realisations)) ** 2
+    return float(_FLOAT) * (float(views) * pixels * per_pixel + decomposed) + _SOLUTION_BYTES
+
+
+def span_bytes(columns: int) -> float:
+    """Peak of the Gram matrix of so many columns, made dense, with its factor."""
+    return float(_FLOAT * _SPAN_SQUARES) * columns**2
 
 
 def pairs_bytes(entries: int, weights: int) -> float:

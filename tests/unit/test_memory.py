@@ -15,6 +15,7 @@ from wallmirror.captures import CaptureSet
 from wallmirror.derendering import problem, splines
 from wallmirror.derendering.problem import prepare
 from wallmirror.derendering.solve import solve
+from wallmirror.derendering.subspace import space_within
 from wallmirror.geometry import Observer
 from wallmirror.pathtracing.filming import render_captures, render_one_hot
 from wallmirror.scene import load_scene
@@ -160,6 +161,16 @@ def test_captures_too_large_to_solve_are_refused(monkeypatch: pytest.MonkeyPatch
     )
     monkeypatch.setattr(problem, "require_memory", lambda needed, what: None)
     prepare(captures)  # the twin
+
+
+def test_a_span_too_large_to_be_made_dense_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel = build_kernel(thesis_observer(50, 2), thesis_card(), weights="cosine")
+    designs = splines.design_matrices(kernel, splines.grid_for(kernel, step=np.radians(1), degree=3))
+    data = np.random.default_rng(0).random((100, 6))
+    foretold = memory.span_bytes(sum(t.shape[1] for t in designs))
+    assert peak(lambda: space_within(data, designs, 4, noise=1.0)) <= foretold  # the twin
+    too_large(monkeypatch, f"{foretold / 2e9:g}")
+    assert "the span of 4 elements" in str(refused(lambda: space_within(data, designs, 4, noise=1.0)))
 
 
 def test_too_many_knots_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,6 +20,8 @@ import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from wallmirror.memory import require_memory, span_bytes
+
 Array = NDArray[np.float64]
 
 # Above this many elements the M^2 x M^2 matrix is not formed; Lanczos finds its two leading pairs.
@@ -145,6 +147,7 @@ def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noi
         Its standard deviation; None to estimate it from what the projection takes away.
     """
     span = sp.csc_array(sp.hstack(designs))
+    require_memory(span_bytes(span.shape[1]), f"the span of {len(designs)} elements on {designs[0].shape[1]} knots")
     # Pivoted Cholesky of the Gram matrix: the columns that span, best first, and the triangle that makes them orthonormal.
     factor, pivots, dimensions, _ = lapack.dpstrf((span.T @ span).toarray(), lower=True, tol=-1.0)
     strength = np.diag(factor)[:dimensions]
