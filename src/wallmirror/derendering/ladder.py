@@ -53,6 +53,7 @@ class Ladder:
     _designs: dict[int, list[sp.csr_array]] = field(default_factory=dict)
     _summed: dict[int, Moments] = field(default_factory=dict)
     _bands: dict[int, Array] = field(default_factory=dict)
+    _groups: dict[int, Groups] = field(default_factory=dict)
     _closed: dict[int, ClosedForm] = field(default_factory=dict)
     _free: dict[int, Fit] = field(default_factory=dict)
     _bounded: dict[int, Fit] = field(default_factory=dict)
@@ -91,10 +92,8 @@ class Ladder:
     def summed(self, index: int) -> Moments:
         """What the likelihood needs of the data."""
         if index not in self._summed:
-            made, groups = (
-                moments(self.problem.data, self.designs(index), self.problem.inverse_variance),
-                self.groups(index),
-            )
+            made = moments(self.problem.data, self.designs(index), self.problem.inverse_variance)
+            groups = self.groups(index)
             self._summed[index] = replace(made, apart=groups.cells) if len(groups) > 1 else made
         return self._summed[index]
 
@@ -111,7 +110,9 @@ class Ladder:
 
     def groups(self, index: int) -> Groups:
         """The elements that share coefficients on these knots."""
-        return groups_of(self.designs(index))
+        if index not in self._groups:
+            self._groups[index] = groups_of(self.designs(index))
+        return self._groups[index]
 
     def band(self, index: int) -> Array:
         """Lower band of sum_i T_i^T W T_i."""
