@@ -236,18 +236,21 @@ class GaussianTrain(AngleSumBRDF):
         u = np.asarray(u, dtype=np.float64)
         angle = np.atleast_1d(u)
         # exp(-z^2/2) directly: dividing a density by its peak turns into 0/0 for tiny sigma. Where it falls below 1e-305 it
-        # is 0, since an exp that underflows takes eight times as long.
+        # is 0, since an exp that underflows takes eight times as long; clip takes half as long as maximum.
         total = np.zeros(angle.shape)
+        z = np.empty(angle.shape)
+        narrowness = 1 / self.sigma  # infinite for a denormal width alone
+        nothing = 0.0
         for centre in self.centres:
-            z = angle - centre
+            np.subtract(angle, centre, out=z)
             with np.errstate(over="ignore"):
-                z /= self.sigma
+                np.multiply(z, narrowness, out=z) if narrowness < math.inf else np.divide(z, self.sigma, out=z)
                 z *= z
             z *= -0.5
-            np.maximum(z, _FAR, out=z)
-            np.exp(z, out=z)
-            z -= _NOTHING
-            total += z
+            np.clip(z, _FAR, 0.0, out=z)
+            total += np.exp(z, out=z)
+            nothing += _NOTHING
+        total -= nothing  # summed as the lobes are, so that what is left where all are far is 0 and never less
         total *= self._peak()
         return total.reshape(u.shape)
 

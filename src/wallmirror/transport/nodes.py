@@ -90,11 +90,9 @@ class Nodes:
             for p, across in enumerate(of_pixel):
                 seen = self._seen(observer, part + across)
                 for s in range(of_strip.size):
-                    theta_s, theta_o, weight = self._transported(*seen, sources[..., s])
+                    theta_s, theta_o, weight = self._transported(*seen, sources[..., s], average[p, s])
                     rho = brdf.of_sum(theta_s + theta_o) if isinstance(brdf, AngleSumBRDF) else brdf(theta_s, theta_o)
-                    if weight is not None:
-                        rho *= weight
-                    rho *= average[p, s]
+                    rho *= weight
                     sums += rho
             transport[block] = np.moveaxis(sums, 0, -1)
         return transport
@@ -107,8 +105,7 @@ class Nodes:
             x[:, :, None, :, None] for x in self._seen(self.observer, pixel_tangents(self.observer)[:, None] + of_pixel)
         )
         source_x = np.asarray(self.card.elements_x)[:, None, None] + of_strip
-        theta_s, theta_o, weight = self._transported(wall_x, theta_o, reach, source_x)
-        weight = np.broadcast_to(average, theta_s.shape) if weight is None else np.multiply(weight, average, out=weight)
+        theta_s, theta_o, weight = self._transported(wall_x, theta_o, reach, source_x, average)
         shape = (*theta_s.shape[:3], -1)
         theta_o = np.broadcast_to(theta_o, theta_s.shape)
         return theta_s.reshape(shape), theta_o.reshape(shape), np.ascontiguousarray(weight).reshape(shape)
@@ -128,25 +125,24 @@ class Nodes:
         return wall_x, outgoing_angles(observer, wall_x), self.half_pixel * path
 
     def _transported(
-        self, wall_x: Array, theta_o: Array, reach: Array, source_x: Array
-    ) -> tuple[Array, Array, Array | None]:
-        """theta_s, theta_o and the weight at the nodes; None for a weight of 1."""
+        self, wall_x: Array, theta_o: Array, reach: Array, source_x: Array, average: Array
+    ) -> tuple[Array, Array, Array]:
+        """theta_s, theta_o and the weight at the nodes, times that of the quadrature."""
         card = self.card
         if self.weights != "physical" or card.is_points:
             theta_s = incident_angles(source_x, card.distance, wall_x)
             match self.weights:
                 case "thesis":
-                    return theta_s, theta_o, None
+                    return theta_s, theta_o, np.broadcast_to(average, theta_s.shape)
                 case "cosine":
-                    return theta_s, theta_o, np.cos(theta_s)
+                    return theta_s, theta_o, average * np.cos(theta_s)
                 case _:
-                    return theta_s, theta_o, np.cos(theta_s) ** 4 / card.distance**2
+                    return theta_s, theta_o, average * (np.cos(theta_s) ** 4 / card.distance**2)
         slope = (source_x - wall_x) / card.distance
-        weight = mean_strip_factor(
-            card.distance, slope, card.element_height / 2, reach if self.half_pixel > 0 else None
-        )
-        weight *= card.element_width
-        return np.arctan(slope), theta_o, weight
+        reaches = reach if self.half_pixel > 0 else None
+        weight = mean_strip_factor(card.distance, slope, card.element_height / 2, reaches)
+        weight *= card.element_width * average
+        return np.arctan(slope, out=slope), theta_o, weight
 
 
 def require_weights(weights: str) -> None:

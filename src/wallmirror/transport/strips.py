@@ -10,6 +10,7 @@ from wallmirror.geometry import Array
 
 #: atan x - x / (1 + x^2) = x^3 (2/3 - 4/5 x^2 + 6/7 x^4 ..).
 _BEND = tuple((-1) ** k * (2 * k + 2) / (2 * k + 3) for k in range(14))
+_HUGE = 1e300  # what a product of heights is cut to, far beyond where it decides anything
 
 
 def strip_factor(distance: float, dx: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:
@@ -65,36 +66,33 @@ def mean_strip_factor(distance: float, slope: Array, half: float, reach: Array |
 
     With G(h) = z^2 h atan(h / a) / (2 a^3), whose derivative is the antiderivative of `strip_factor`, the mean is
     [G(half + reach) - G(half - reach)] / reach; sum and difference of the arctangents are taken as one each, since both
-    may cancel.
+    may cancel. With s = a / z and p = (half^2 - reach^2) / z^2 they are the angles of (s^2 + p, 2 s reach / z) and
+    (s^2 - p, 2 s half / z): no division.
 
     Parameters
     ----------
     slope:
-        tan theta_s = dx / z, so that a^2 = z^2 (1 + slope^2).
+        tan theta_s = dx / z, so that s^2 = 1 + slope^2.
     reach:
         None for points.
     """
     with np.errstate(over="ignore", divide="ignore"):  # beyond 1e154 z nothing arrives
         square = slope * slope
         square += 1.0
-        inverse = np.sqrt(square)  # 1 / a
-        inverse *= distance
-        np.divide(1.0, inverse, out=inverse)
+        root = np.sqrt(square)
         if reach is None:
-            h = half * inverse
+            h = half / distance / root
             mean = 1 / (h + 1 / h)  # h / (1 + h^2), whose square may overflow
             mean += np.arctan(h, out=h)
-            mean *= 2
+            mean *= 1 / distance
         else:
-            product, both = (half + reach) * inverse, (half - reach) * inverse
-            product *= both
-            mean = 1 + product
-            np.arctan2(np.multiply(2 * reach, inverse, out=both), mean, out=mean)
+            product = np.clip((half + reach) / distance * ((half - reach) / distance), -_HUGE, _HUGE)
+            y, x = root * (2 * reach / distance), square + product
+            mean = np.arctan2(y, x)
             mean *= half / reach
-            np.subtract(1, product, out=product)
-            np.arctan2(np.multiply(2 * half, inverse, out=both), product, out=both)
-            mean += both
-    mean *= 0.5
-    mean *= inverse
-    mean /= square
+            np.arctan2(np.multiply(root, 2 * half / distance, out=y), np.subtract(square, product, out=x), out=y)
+            mean += y
+            mean *= 0.5 / distance
+        square *= root
+        mean /= square
     return mean
