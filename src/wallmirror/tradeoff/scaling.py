@@ -24,11 +24,11 @@ _SHARES = (0.85, 0.7, 0.55, 0.4)
 SWEEPS = (
     Sweep(MODEL, "pixels N", "transport", "pixels", BASE["pixels"], 10**9, "pixels"),
     Sweep(MODEL, "elements M", "transport", "elements", BASE["elements"], 10**9, "elements"),
-    Sweep(MODEL, "views A", "transport", "views", BASE["views"], 10**8, "views"),
+    Sweep(MODEL, "views A", "transport", "views", BASE["views"], 10**6, "views"),
     Sweep(MODEL, "quadrature nodes Q", "transport", "strip nodes", BASE["strip nodes"], 256, "nodes a strip", False),
     Sweep(SOLVER, "pixels N", "solve", "pixels", BASE["pixels"], 10**9, "pixels"),
     Sweep(SOLVER, "elements M", "solve", "elements", BASE["elements"], 4096, "elements"),
-    Sweep(SOLVER, "views A", "solve", "views", BASE["views"], 10**8, "views"),
+    Sweep(SOLVER, "views A", "solve", "views", BASE["views"], 10**6, "views"),
     Sweep(SOLVER, "realisations B", "solve", "realisations", BASE["realisations"], 10**8, "realisations"),
     Sweep(TRACER, "picture width", "picture", "width", 64, 2**20, "pixels wide"),
 )
