@@ -32,6 +32,7 @@ from scipy.stats import f as f_distribution
 from wallmirror.derendering.convex import solve_positive
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.facets import FITTED, PRIOR_STD, Factor, logarithm
+from wallmirror.derendering.groups import groups_of, one_group
 from wallmirror.derendering.information import information
 from wallmirror.derendering.moments import moments
 from wallmirror.derendering.problem import Problem
@@ -53,6 +54,7 @@ SLIGHT = 1e-3
 # Bars are widened to this share of the pattern at most: beyond it an answer counts as undetermined, and whether it is that
 # is for noise and geometry to say, not for a hypothesis that they cannot test.
 _WIDEST = 0.5
+_FIT_FACETS = '; fit facets (wall "auto", no scale by an albedo), or use the general method'
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,8 +170,12 @@ def _derivatives(
         known = information(moments(problem.data, designs, weights), r, source)
     cells = np.flatnonzero(known.seen)
     level = float(np.trace(known.schur)) / max(1, cells.size)
-    # The gauge keeps r off the scale's null direction; the ridge is for barely seen cells.
-    schur = known.schur + level * np.outer(r[cells], r[cells]) / max(float(r[cells] @ r[cells]), 1e-300)
+    # The gauge keeps r off the null direction of each scale; the ridge is for barely seen cells.
+    groups = groups_of(designs) if estimate.groups else one_group(designs)
+    schur = known.schur.copy()
+    for mine in groups.cells:
+        part = np.where(mine, r, 0.0)[cells]
+        schur += level * np.outer(part, part) / max(float(part @ part), 1e-300)
     schur[np.diag_indices_from(schur)] += _RIDGE * level
     lit = kernel.weight * grid.evaluate(r, kernel.angle_sum)
     # The change of F, (P, M), and that of the films as J and F see them: T_i^T W m_b, (B, M, K).
@@ -190,7 +196,10 @@ def _derivatives(
         dv = (np.einsum("bij,bj->bi", known.inverse, along) - np.einsum("bmk,k->bm", known.coupled, dr[cells])).T
         moved = np.stack([t @ dr for t in designs], axis=1)
         unexplained.append((change - moved) @ source - estimate.transport @ dv)
-        turns.append(-dv + source * (np.sum(dv * source) / np.sum(source**2)))
+        for elements in map(list, groups.elements):  # a change of scale is no turn
+            own = source[elements]
+            dv[elements] -= own * (np.sum(dv[elements] * own) / np.sum(own**2))
+        turns.append(-dv)
     return unexplained, turns
 
 
@@ -232,7 +241,7 @@ def with_doubt(estimate: Estimate, check: AngleSumCheck) -> Estimate:
             if check.assumed
             else "Hypothesis 8 (angle sum) does not hold, or wrong geometry or light beyond one bounce looks like that"
         )
-        remedy = "" if check.assumed else '; fit facets (wall "auto", no scale by an albedo), or use the general method'
+        remedy = "" if check.assumed or estimate.groups else _FIT_FACETS
         warnings = (
             f"{which}: a wall that depends on both angles fits better and turns the pattern by about "
             f"{100 * check.bias:.2g} %; the error bars were widened to match{remedy}",

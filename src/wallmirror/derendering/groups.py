@@ -70,6 +70,11 @@ def groups_of(designs: list[sp.csr_array]) -> Groups:
     return Groups(elements, np.stack([sees[list(group)].any(axis=0) for group in elements]))
 
 
+def one_group(designs: list[sp.csr_array]) -> Groups:
+    """All elements together, whatever they share."""
+    return Groups((tuple(range(len(designs))),), np.ones((1, designs[0].shape[1]), dtype=bool))
+
+
 def closed_form_in_groups(data: Array, designs: list[sp.csr_array], space: SignalSpace, groups: Groups) -> ClosedForm:
     """The closed form of each group's part of rho, put together; mismatch and gap are those of the worst group.
 

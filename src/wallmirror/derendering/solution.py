@@ -156,7 +156,7 @@ class Solution:
         What light beyond one bounce would do to this solution; None where nothing but the wall reflects.
     angle_sum_check:
         What a wall that is no function of the angle sum would do to this solution, and the factors that `brdf` is to be
-        multiplied with where a wall of facets was fitted; None where groups of elements have a scale each.
+        multiplied with where a wall of facets was fitted; None for a closed form of groups with a scale each.
     seconds:
         Time the solver took.
     history:

@@ -228,9 +228,12 @@ def solve(
                 "a scale is open for each group of elements, and with it the exponents of a wall of facets; use views or a "
                 "card whose reflections share more angles"
             )
-        if estimate.method != "closed_form" and estimate.predicted_error <= UNDETERMINED and not estimate.groups:
-            problem, estimate, angle_sum = settle(problem, estimate, refit if few else fit, check_angle_sum)
-        if angle_sum is not None and not estimate.groups:
+        if estimate.method != "closed_form" and estimate.predicted_error <= UNDETERMINED:
+            if estimate.groups:  # no facets are fitted to scales that are open
+                angle_sum = check_angle_sum(problem, estimate)
+            else:
+                problem, estimate, angle_sum = settle(problem, estimate, refit if few else fit, check_angle_sum)
+        if angle_sum is not None:
             estimate = with_doubt(estimate, angle_sum)
         if calibration is not None:
             tell(f"the same with the card one standard deviation aside, {len(calibration.aside)} times")
