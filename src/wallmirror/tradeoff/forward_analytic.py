@@ -18,10 +18,11 @@ from wallmirror.errors import InputError
 from wallmirror.geometry import Card, Observer
 from wallmirror.scene import load_scene
 from wallmirror.tradeoff.clock import timed
-from wallmirror.tradeoff.forward_task import IMAGE, Task, run_of
+from wallmirror.tradeoff.forward_task import IMAGE, Task
 from wallmirror.tradeoff.reference import points_in_extended_precision
 from wallmirror.tradeoff.runs import Run
 from wallmirror.tradeoff.single_precision import transport_in_single_precision
+from wallmirror.tradeoff.timed_runs import run_of
 from wallmirror.transport import radiance, transport_matrix
 
 Array = NDArray[np.float64]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +10,8 @@ from numpy.typing import NDArray
 from wallmirror.brdf import GaussianTrain
 from wallmirror.geometry import Card, Observer
 from wallmirror.scene import Scene, load_scene
-from wallmirror.tradeoff.clock import Timing
 from wallmirror.tradeoff.reference import brute_force
-from wallmirror.tradeoff.runs import Run, Statement
+from wallmirror.tradeoff.runs import Statement
 from wallmirror.transport import radiance, transport_matrix
 
 Array = NDArray[np.float64]
@@ -73,27 +70,4 @@ def check_reference(task: Task, entries: int) -> tuple[Statement, float]:
             worst < 1e-9,
         ),
         worst,
-    )
-
-
-def run_of(
-    group: str,
-    method: str,
-    knobs: dict[str, Any],
-    timing: Timing,
-    error: float,
-    *,
-    work: float = math.nan,
-    **extra: float,
-) -> Run:
-    """A run of a method, with the time that it took."""
-    return Run(
-        group=group,
-        method=method,
-        knobs=knobs,
-        seconds=timing.seconds,
-        wall_seconds=timing.wall_seconds,
-        error=error,
-        work=work,
-        extra=extra,
     )

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from wallmirror.brdf import tabulate
 from wallmirror.tradeoff.clock import Timing, once
-from wallmirror.tradeoff.forward_task import IMAGE, Task, run_of
+from wallmirror.tradeoff.forward_task import IMAGE, Task
 from wallmirror.tradeoff.runs import Run
+from wallmirror.tradeoff.timed_runs import run_of
 
 Array = NDArray[np.float64]
 

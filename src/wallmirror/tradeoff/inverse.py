@@ -22,11 +22,10 @@ from wallmirror.derendering.problem import prepare
 from wallmirror.derendering.solve import solve
 from wallmirror.derendering.subspace import closed_form
 from wallmirror.derendering.unstructured import de_render_unstructured
-from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card, Observer, scan_angles
-from wallmirror.tradeoff.clock import once
 from wallmirror.tradeoff.pareto import short_seconds
 from wallmirror.tradeoff.runs import Omission, Panel, Run, Statement, by_method
+from wallmirror.tradeoff.timed_runs import solved_run
 from wallmirror.transport import Weights, radiance, transport_matrix
 
 Array = NDArray[np.float64]
@@ -86,7 +85,7 @@ def inverse(*, quick: bool = False, seed: int = 0, progress: Advance | None = No
         group = f"{level} dB"
         floors[group] = film.bound
         for method, knobs, work, on in _settings(film, quick=quick):
-            runs.append(_measured(group, method, {**knobs, "draw": draw}, work, on))
+            runs.append(solved_run(group, method, {**knobs, "draw": draw}, work, on.source, bound=on.bound))
         if progress is not None:
             progress(number + 1, total)
     return Panel(
@@ -235,31 +234,6 @@ def _counted(film: _Film, counts: float) -> _Film:
         radiance=np.asarray((photons - _BACKGROUND) / counts, dtype=np.float64),
     )
     return _Film(captures, film.source, film.sigma, _bound(captures, film.source, np.sqrt(expected) / counts))
-
-
-def _measured(group: str, method: str, knobs: dict[str, Any], work: Callable[[], Array], on: _Film) -> Run:
-    failure = ""
-
-    def attempt() -> Array | None:
-        nonlocal failure
-        try:
-            return work()
-        except UndeterminedError as refusal:
-            failure = str(refusal)
-            return None
-
-    found, timing = once(attempt)
-    error = math.nan if found is None else scale_free_error(found, on.source)
-    return Run(
-        group=group,
-        method=method,
-        knobs=knobs,
-        seconds=timing.seconds,
-        wall_seconds=timing.wall_seconds,
-        error=error,
-        failure=failure,
-        extra={"bound": on.bound},
-    )
 
 
 def _by_setting(runs: Sequence[Run]) -> dict[str, tuple[Run, ...]]:

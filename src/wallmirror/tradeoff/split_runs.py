@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet
-from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.foresight import foresee
 from wallmirror.derendering.solve import solve
-from wallmirror.errors import UndeterminedError
 from wallmirror.tradeoff.clock import once
 from wallmirror.tradeoff.runs import Run
 from wallmirror.tradeoff.splits import Noise, Split, World
+from wallmirror.tradeoff.timed_runs import run_of, solved_run
 from wallmirror.transport import radiance
 
 Array = NDArray[np.float64]
@@ -50,15 +49,7 @@ def foretold_run(group: str, world: World, split: Split, noise: Noise) -> Run:
 
     error, timing = once(forecast)
     failure = "" if math.isfinite(error) else "the captures would not determine the pattern"
-    return Run(
-        group=group,
-        method=FORETOLD,
-        knobs=knobs,
-        seconds=timing.seconds,
-        wall_seconds=timing.wall_seconds,
-        error=error if not failure else math.nan,
-        failure=failure,
-    )
+    return run_of(group, FORETOLD, knobs, timing, error if not failure else math.nan, failure=failure)
 
 
 def chosen_splits(found: Sequence[Run]) -> list[Run]:
@@ -102,25 +93,8 @@ def rendered_run(group: str, world: World, foretold: Run, seed: int) -> Run:
 def _solved(
     group: str, method: str, knobs: dict[str, Any], captures: CaptureSet, world: World, foretold: Run, **extra: float
 ) -> Run:
-    failure = ""
+    def solver() -> Array:
+        return solve(captures, method="maximum_likelihood", nonnegative=False, step_deg=STEP_DEG).source
 
-    def attempt() -> Array | None:
-        nonlocal failure
-        try:
-            return solve(captures, method="maximum_likelihood", nonnegative=False, step_deg=STEP_DEG).source
-        except UndeterminedError as refusal:
-            failure = str(refusal)
-            return None
-
-    found, timing = once(attempt)
     truth = world.source[:, : captures.realisations]
-    return Run(
-        group=group,
-        method=method,
-        knobs=knobs,
-        seconds=timing.seconds,
-        wall_seconds=timing.wall_seconds,
-        error=math.nan if found is None else scale_free_error(found, truth),
-        failure=failure,
-        extra={"foretold": foretold.error, **extra},
-    )
+    return solved_run(group, method, knobs, solver, truth, foretold=foretold.error, **extra)
