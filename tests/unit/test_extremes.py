@@ -109,10 +109,10 @@ PLANTED = {
         "transport.nodes._fastest", lambda one, *_: np.zeros_like(one),
         kernels.kernel_cases, "build_kernel, physical", "card's", "0.01"),
     "lengths in metres to the fourth power": (
-        "interreflection.power_of_two", _no_unit,
+        "interreflection.card.power_of_two", _no_unit,
         bounces.card_cases, "glow_in_mirror", "scene x 2^k", "k = -300"),
     "places rounded to 1e-12 m": (
-        "interreflection.power_of_two", _no_unit,
+        "interreflection.card.power_of_two", _no_unit,
         bounces.card_cases, "from_card", "scene x 2^k", "k = -20"),
     "renders of 1e300": (
         "convolution.spherical.power_of_two", _no_unit,

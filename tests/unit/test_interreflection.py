@@ -8,7 +8,8 @@ from scipy.integrate import quad
 
 from wallmirror import CaptureSet, Card, Diffuse, GaussianTrain, Observer, Room, Sum, radiance, solve, transport_matrix
 from wallmirror.brdf import directional_albedo
-from wallmirror.interreflection import _through_wall, from_card, from_room
+from wallmirror.interreflection import from_card, from_room
+from wallmirror.interreflection.card import _through_wall
 
 OBSERVER = Observer(position=(0.0, -5.0), fov=math.radians(60), view_angles=(0.25, 0.08, -0.08, -0.25), pixels=100)
 SATIN = Sum(

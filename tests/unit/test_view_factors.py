@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from wallmirror.brdf import Diffuse
 from wallmirror.geometry import Card, Observer, wall_points
-from wallmirror.interreflection import _exchange, _Patches, _room_patches, _seen_over_wall
+from wallmirror.interreflection.room import _exchange, _Patches, _room_patches, _seen_over_wall
 from wallmirror.scene import Room
 from wallmirror.transport import transport_matrix
 
