@@ -21,18 +21,10 @@ u = theta_s + theta_o; all are constant along z (see `base`).
 from wallmirror.brdf.audits import Audit, Finding, audit
 from wallmirror.brdf.base import BRDF, AngleSumBRDF, LobeForm
 from wallmirror.brdf.energy import directional_albedo, directional_albedos
-from wallmirror.brdf.lobes import (
-    Blinn,
-    Diffuse,
-    GaussianTrain,
-    GeneralSum,
-    LobeHeight,
-    Mirror,
-    Phong,
-    PhongIllumination,
-    Sum,
-)
+from wallmirror.brdf.ideal import Diffuse, Mirror
+from wallmirror.brdf.lobes import Blinn, GaussianTrain, LobeHeight, Phong, PhongIllumination
 from wallmirror.brdf.microfacet import CookTorrance, FacetDistribution, Facets, Fresnel, Schlick
+from wallmirror.brdf.sums import GeneralSum, Sum
 from wallmirror.brdf.tables import AngleSumTable, Table, Tabulated, tabulate, tabulate_to
 
 __all__ = [

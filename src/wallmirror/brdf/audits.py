@@ -18,7 +18,7 @@ from scipy.optimize import minimize_scalar
 
 from wallmirror.brdf.base import BRDF, AngleSumBRDF, Array, require_range
 from wallmirror.brdf.energy import directional_albedos
-from wallmirror.brdf.lobes import Mirror
+from wallmirror.brdf.ideal import Mirror
 from wallmirror.errors import InputError
 
 #: How close to the horizon an audit looks, in radians.

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from wallmirror.brdf.base import BRDF, Array
-from wallmirror.brdf.lobes import Mirror
+from wallmirror.brdf.ideal import Mirror
 from wallmirror.errors import InputError
 
 _LEAST_PANELS = 90

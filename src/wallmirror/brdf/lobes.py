@@ -1,4 +1,4 @@
-"""Diffuse, mirror, and the lobes of the angle sum: Phong, Blinn, trains of Gaussians, and sums of models."""
+"""Lobes: Phong, Blinn and trains of Gaussians in the angle sum, and Phong's formula of 1975."""
 
 from __future__ import annotations
 
@@ -24,39 +24,6 @@ _MAX_EXPONENT = 1e8
 _LEAST_COSINE = 1e-15
 #: Of Gamma(a + 1/2) / (Gamma(a) sqrt(a)).
 _GAMMA_QUOTIENT = (1, -1 / 8, 1 / 128, 5 / 1024, -21 / 32768, -399 / 262144, 869 / 4194304)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Diffuse(AngleSumBRDF):
-    """Lambertian: albedo / pi everywhere (eq. 1.12)."""
-
-    albedo: float = 0.5
-
-    def __post_init__(self) -> None:
-        require_range("wall.albedo", self.albedo, 0, 1)
-
-    def of_sum(self, u: ArrayLike) -> Array:
-        """Value in 1/sr at angle sums u in radians, same shape."""
-        return np.where(np.isnan(np.asarray(u, dtype=np.float64)), np.nan, self.albedo / math.pi)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Mirror(BRDF):
-    """A perfect mirror, delta(theta_s + theta_o) (eqs. 1.11, 2.14): a distribution, without finite values.
-
-    `transport` integrates it exactly over pixels instead of sampling it.
-    """
-
-    reflectance: float = 1.0
-
-    def __post_init__(self) -> None:
-        require_range("wall.reflectance", self.reflectance, 0, 1)
-
-    def __call__(self, theta_s: ArrayLike, theta_o: ArrayLike) -> Array:
-        """Refused: a delta has no values."""
-        raise InputError(
-            "is a mirror, a delta without values; `transport_matrix` renders it exactly", field="wall.brdf"
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -266,63 +233,10 @@ class GaussianTrain(AngleSumBRDF):
         return min(math.pi / 4, self.sigma)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sum(AngleSumBRDF):
-    """The sum of angle-sum models, e.g. lobes over a diffuse coat."""
-
-    parts: tuple[AngleSumBRDF, ...]
-
-    def __post_init__(self) -> None:
-        if not all(isinstance(part, AngleSumBRDF) for part in self.parts):
-            raise InputError("holds a model that is no function of the angle sum; use a GeneralSum", field="wall.parts")
-        _require_parts(self.parts)
-
-    def of_sum(self, u: ArrayLike) -> Array:
-        """Value in 1/sr at angle sums u in radians, same shape."""
-        total = np.zeros(np.shape(u))
-        for part in self.parts:
-            total += part.of_sum(u)
-        return total
-
-    @property
-    def angular_scale(self) -> float:
-        """The finest of its parts."""
-        return min(part.angular_scale for part in self.parts)
-
-
-@dataclass(frozen=True, kw_only=True)
-class GeneralSum(BRDF):
-    """The sum of any models with finite values, e.g. microfacets over a diffuse ground."""
-
-    parts: tuple[BRDF, ...]
-
-    def __post_init__(self) -> None:
-        _require_parts(self.parts)
-
-    def __call__(self, theta_s: ArrayLike, theta_o: ArrayLike) -> Array:
-        """Value in 1/sr, broadcast over two arrays of angles in radians."""
-        total = np.zeros(np.broadcast_shapes(np.shape(theta_s), np.shape(theta_o)))
-        for part in self.parts:
-            total += part(theta_s, theta_o)
-        return total
-
-    @property
-    def angular_scale(self) -> float:
-        """The finest of its parts."""
-        return min(part.angular_scale for part in self.parts)
-
-
 def _require_lobe(exponent: float, reflectance: float, form: str) -> None:
     require_range("wall.exponent", exponent, 0, _MAX_EXPONENT)
     require_range("wall.reflectance", reflectance, 0, 1)
     require_choice("wall.form", form, get_args(LobeForm))
-
-
-def _require_parts(parts: tuple[BRDF, ...]) -> None:
-    if not parts or any(isinstance(part, Mirror) for part in parts):
-        raise InputError(
-            "needs at least one model, and none that is a mirror: a delta has no values", field="wall.parts"
-        )
 
 
 def _power_of_cosine(angle: Array, exponent: float) -> Array:
