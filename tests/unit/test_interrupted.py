@@ -30,7 +30,8 @@ from wallmirror.errors import InputError
 from wallmirror.exr import read_exr
 from wallmirror.files import write_together
 from wallmirror.jobs.capturing import fingerprint, planned_before, truth_of
-from wallmirror.jobs.solving import Solved, write_solution
+from wallmirror.jobs.solved import Solved
+from wallmirror.jobs.solving import write_solution
 from wallmirror.planning import CapturePlan, Sampling, Term
 from wallmirror.scene import Scene
 

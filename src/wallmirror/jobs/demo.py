@@ -12,8 +12,10 @@ from typing import Any
 from wallmirror.brdf import AngleSumBRDF, directional_albedo
 from wallmirror.files import write_atomically
 from wallmirror.jobs.capturing import capture_scene
-from wallmirror.jobs.solving import Solved, solution_sections, solve_directory
-from wallmirror.jobs.solving import verdicts as solution_verdicts
+from wallmirror.jobs.solution_report import solution_sections
+from wallmirror.jobs.solution_report import verdicts as solution_verdicts
+from wallmirror.jobs.solved import Solved
+from wallmirror.jobs.solving import solve_directory
 from wallmirror.jobs.validating_one import Validation, validate_scene
 from wallmirror.jobs.validation_report import numbers
 from wallmirror.jobs.validation_report import verdict as validation_verdict

@@ -22,7 +22,7 @@ from wallmirror.errors import InputError
 from wallmirror.interreflection import glow_in_mirror
 from wallmirror.jobs.bouncing import DEEP, RR_DEPTH, json_of, spread
 from wallmirror.jobs.capturing import truth_of
-from wallmirror.jobs.solving import judge
+from wallmirror.jobs.solved import judge
 from wallmirror.pathtracing.filming import render_captures
 from wallmirror.pathtracing.rendering import spread_seeds
 from wallmirror.scene import Scene

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from wallmirror.captures import CaptureSet, read_captures, read_truth
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.general import GeneralSolution, solve_general
-from wallmirror.jobs.solving import csv_text, source_csv, write_results
+from wallmirror.jobs.solution_files import csv_text, source_csv, write_results
 from wallmirror.report import FigureBlock, Section, TableBlock, Verdict, page_html
 from wallmirror.report.figures import recovered_source, recovered_table, scene_plan
 
