@@ -10,7 +10,8 @@ import pytest
 
 from wallmirror.errors import InputError
 from wallmirror.jobs.picturing import WHOLE, measure_picture_bounces
-from wallmirror.pathtracing.picturing import PictureRenderer, lobes_as_rendered
+from wallmirror.pathtracing.picture_building import lobes_as_rendered
+from wallmirror.pathtracing.picturing import PictureRenderer
 from wallmirror.picture_reading import load_picture
 from wallmirror.picture_scene import (
     Background,
