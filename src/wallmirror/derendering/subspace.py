@@ -18,9 +18,6 @@ import scipy.linalg as sl
 import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
-from scipy.linalg import lapack
-
-from wallmirror.memory import require_memory, span_bytes
 
 Array = NDArray[np.float64]
 
@@ -130,40 +127,6 @@ def noise_edge(rows: int, columns: int, units: float = CERTAIN) -> float:
     edge = math.sqrt(rows) + math.sqrt(columns)
     scale = edge * (1 / math.sqrt(rows) + 1 / math.sqrt(columns)) ** (1 / 3)
     return math.sqrt(edge**2 + units * scale)
-
-
-def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noise: float | None) -> SignalSpace:
-    """U from the data's projection onto what any BRDF on the designs' grid could make of any pattern.
-
-    All of F V lies in the span of T_1 .. T_M, whose dimension is at most M K; noise fills all P dimensions. The
-    projection leaves the signal and takes all but M K / P of the noise's power away, so that patterns stand out which
-    drown in the films as they are.
-
-    Parameters
-    ----------
-    data, designs:
-        D (P, B) and T_1 .. T_M (P, K), rows weighted so that the noise of all is alike.
-    noise:
-        Its standard deviation; None to estimate it from what the projection takes away.
-    """
-    span = sp.csc_array(sp.hstack(designs))
-    require_memory(span_bytes(span.shape[1]), f"the span of {len(designs)} elements on {designs[0].shape[1]} knots")
-    # Pivoted Cholesky of the Gram matrix: the columns that span, best first, and the triangle that makes them orthonormal.
-    factor, pivots, dimensions, _ = lapack.dpstrf((span.T @ span).toarray(), lower=True, tol=-1.0)
-    strength = np.diag(factor)[:dimensions]
-    dimensions = int(np.count_nonzero(strength * strength > 1e-10 * strength[0] * strength[0]))
-    span, triangle = span[:, pivots[:dimensions] - 1], factor[:dimensions, :dimensions]
-    projected = sl.solve_triangular(triangle, span.T @ data, lower=True, check_finite=False)
-    left, singular, _ = np.linalg.svd(projected, full_matrices=False)
-    if noise is None:
-        rest = max(0.0, float(np.sum(data * data) - np.sum(projected * projected)))
-        noise = math.sqrt(rest / max(1, (data.shape[0] - dimensions) * data.shape[1]))
-    floor = noise * noise_edge(dimensions, data.shape[1])
-    # The span's weakest directions are known to the root of what was kept of them, no better.
-    rounding = 1e-7 * singular[0]
-    rank = int(np.count_nonzero(singular[:elements] > max(rounding, floor)))
-    within = sl.solve_triangular(triangle, left[:, :elements], lower=True, trans="T", check_finite=False)
-    return SignalSpace(span @ within, singular, rank, dimensions)
 
 
 def closed_form(
