@@ -77,9 +77,10 @@ class Pairs:
         return np.asarray(np.repeat(row, np.diff(self.above.indptr)) + self.above.indices % size)
 
     @cached_property
-    def _counts(self) -> NDArray[np.int64]:
-        """Entries of each pair."""
-        return np.asarray(np.diff(self.above.indptr[:: self.size]))
+    def _flat(self) -> sp.csc_array:
+        """N_ij as columns of (K^2, M (M + 1) / 2), so that a product sums them up."""
+        pointers, size = self.above.indptr[:: self.size], self.size
+        return sp.csc_array((self.above.data, self._where, pointers), shape=(size * size, pointers.size - 1))
 
     @cached_property
     def band(self) -> Array:
@@ -106,10 +107,8 @@ class Pairs:
 
     def mixed(self, products: Array) -> Array:
         """sum_ij products_ij N_ij for symmetric products (M, M), dense (K, K)."""
-        size = self.size
         factors = (products - 0.5 * np.diag(np.diag(products)))[self._of]
-        weights = self.above.data * np.repeat(factors, self._counts)
-        square = np.bincount(self._where, weights=weights, minlength=size * size).reshape(size, size)
+        square = (self._flat @ factors).reshape(self.size, self.size)
         return np.asarray(square + square.T, dtype=np.float64)
 
 
