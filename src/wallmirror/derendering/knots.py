@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from wallmirror.derendering.bounds import Bound, bound_of
 from wallmirror.derendering.climbing import Other, Tell, climb
+from wallmirror.derendering.finer import worth
 from wallmirror.derendering.groups import Groups
 from wallmirror.derendering.information import Information, information
-from wallmirror.derendering.ladder import Ladder
+from wallmirror.derendering.ladder import SPARE, Ladder
 from wallmirror.derendering.likelihood import Fit, maximise
 from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.problem import Problem, expected_mismatch, too_few_patterns
@@ -180,7 +181,10 @@ def _first_worth_a_fit(ladder: Ladder) -> int:
     if ladder.space.rank < ladder.problem.card.elements:
         return 0
     index = max(0, ladder.last - 2)
-    ladder.summed(index)  # which nearly every search asks for, and of which the closed form makes use
+    if _wants_detail(ladder, index + 1):
+        index += 1
+    else:
+        ladder.summed(index)  # which nearly every search asks for, and of which the closed form makes use
     closed = ladder.closed(index)
     expected = expected_mismatch(ladder.problem, ladder.space, closed)
     if math.isnan(expected):
@@ -196,3 +200,11 @@ def _first_worth_a_fit(ladder: Ladder) -> int:
         if closed.mismatch > _ALIKE * coarser.mismatch:
             return finer - 1 if coarser.error < _START else 0
     return 0
+
+
+def _wants_detail(ladder: Ladder, index: int) -> bool:
+    """Whether the noise is so faint that knots twice as far apart would not do, so that no fit on them is called for."""
+    if index < 2 or index == ladder.last or not ladder.problem.noise_is_stated or ladder.spare(index) < SPARE:
+        return False
+    added = ladder.grids[index].size - ladder.grids[index - 1].size
+    return ladder.detail(index) > worth(added, ladder.problem.data.size)

@@ -205,9 +205,11 @@ class Ladder:
 
     def spare(self, index: int) -> float:
         """Share of the data that as many coefficients as the grid has leave over; told before the grid's moments are made."""
-        known = next(iter(self._summed.values()))
-        unknown = self.grids[index].size + known.cross.shape[0] * known.elements
-        return float(1 - unknown / max(1, known.observations))
+        rows, realisations = self.problem.data.shape
+        weights = self.problem.fit_weights
+        observations = np.count_nonzero(weights) * (rows * realisations // weights.size)
+        unknown = self.grids[index].size + realisations * self.problem.card.elements
+        return float(1 - unknown / max(1, observations))
 
     def variance(self, objective: float, freedom: int) -> float:
         """Of the noise in units of the weights: 1 where it is stated, else what a misfit says."""
@@ -221,11 +223,28 @@ class Ladder:
 
     def coarsened(self, index: int, r: Array) -> Array:
         """Coefficients on the next coarser grid that come nearest where the captures look."""
-        halved = self.grids[index - 1].in_halved()
-        weighted = sp.csr_array(halved.multiply(self.summed(index).exposure[:, None]))
-        gram = sp.csc_array(weighted.T @ halved)
-        gram += 1e-9 * float(gram.diagonal().max()) * sp.eye_array(gram.shape[0])
-        return np.asarray(spl.spsolve(gram, weighted.T @ r), dtype=np.float64)
+        return _nearest(self.grids[index - 1].in_halved(), r, self.summed(index).exposure)
+
+    def detail(self, index: int) -> float:
+        """The misfit that knots twice as far apart would make of the closed form, as far as its own detail foretells it.
+
+        What it loses on knots four times as far apart is nearly all error of the spline, not noise, and that falls by
+        2^(degree + 1) with each halving for a smooth rho. Told before the grid's moments are made.
+        """
+        closed, (coarse, fine) = self.closed(index), self.grids[index - 2 : index]
+        prolongation = sp.csr_array(fine.in_halved() @ coarse.in_halved())
+        r = closed.coefficients
+        lost = r - prolongation @ _nearest(prolongation, r, closed.exposure)
+        films = np.stack([t @ lost for t in self.designs(index)], axis=1) @ closed.source
+        return float(np.sum(self.problem.fit_weights * films**2)) / 4.0 ** (fine.degree + 1)
+
+
+def _nearest(prolongation: sp.csr_array, r: Array, exposure: Array) -> Array:
+    """Coefficients r' of which the prolongation R r' comes nearest to r where the captures look."""
+    weighted = sp.csr_array(prolongation.multiply(exposure[:, None]))
+    gram = sp.csc_array(weighted.T @ prolongation)
+    gram += 1e-9 * float(gram.diagonal().max()) * sp.eye_array(gram.shape[0])
+    return np.asarray(spl.spsolve(gram, weighted.T @ r), dtype=np.float64)
 
 
 def _quadrature(problem: Problem, tolerance: float | None) -> float:
