@@ -173,7 +173,7 @@ def _tested(
     found = score(
         films,
         ladder.designs(finer),
-        ladder.band(finer),
+        ladder.smooth_band(finer),
         free,
         enough=enough,
         # From the maximum a search finds less with each step; from a fit that bounds hold elsewhere it may find most late.

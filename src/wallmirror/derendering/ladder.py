@@ -18,7 +18,7 @@ from wallmirror.derendering.groups import Groups, closed_form_in_groups, groups_
 from wallmirror.derendering.likelihood import Fit, best_nonnegative, maximise
 from wallmirror.derendering.moments import Moments, moments
 from wallmirror.derendering.problem import Problem
-from wallmirror.derendering.splines import SplineGrid, design_matrices
+from wallmirror.derendering.splines import SplineGrid, design_matrices, exposures
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, banded_gram, closed_form
 from wallmirror.errors import UndeterminedError
 from wallmirror.transport import Kernel
@@ -53,6 +53,7 @@ class Ladder:
     _designs: dict[int, list[sp.csr_array]] = field(default_factory=dict)
     _summed: dict[int, Moments] = field(default_factory=dict)
     _bands: dict[int, Array] = field(default_factory=dict)
+    _smooth_bands: dict[int, Array] = field(default_factory=dict)
     _groups: dict[int, Groups] = field(default_factory=dict)
     _closed: dict[int, ClosedForm] = field(default_factory=dict)
     _free: dict[int, Fit] = field(default_factory=dict)
@@ -122,6 +123,19 @@ class Ladder:
             else:
                 self._bands[index] = banded_gram(self.problem.weighted(self.designs(index)))
         return self._bands[index]
+
+    def smooth_band(self, index: int) -> Array:
+        """The same, if neighbouring angle sums were seen alike: its diagonal, and the overlaps of splines beside it."""
+        if index in self._bands or index in self._summed:
+            return self.band(index)
+        if index not in self._smooth_bands:
+            grid = self.grids[index]
+            root = np.sqrt(np.sum(exposures(self.designs(index), np.square(self.problem.row_weights[:, 0])), axis=0))
+            band = np.zeros((grid.degree + 1, grid.size))
+            for d, overlap in enumerate(grid.overlaps()):
+                band[d, : grid.size - d] = overlap * root[: grid.size - d] * root[d:]
+            self._smooth_bands[index] = band
+        return self._smooth_bands[index]
 
     def bounded(self, index: int, free: Fit) -> Fit:
         """The maximum within the bounds, from the free one, or from coarser knots where that leads nowhere near it."""
