@@ -223,7 +223,7 @@ def test_the_closed_forms_detail_foretells_what_coarser_knots_lose() -> None:
     foretold = {}
     for decibels in (40, 60):
         ladder = ladder_at(decibels)
-        foretold[decibels] = ladder.detail(finer)
+        foretold[decibels] = ladder.foretold(finer, ladder.detail(finer))
         assert not ladder._summed  # before any moments are made
     best = maximise(ladder.summed(finer), ladder.closed(finer).coefficients, nonnegative=False)
     coarse = maximise(ladder.summed(finer - 1), ladder.coarsened(finer, best.coefficients), nonnegative=False)

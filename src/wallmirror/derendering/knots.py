@@ -204,7 +204,11 @@ def _first_worth_a_fit(ladder: Ladder) -> int:
 
 def _wants_detail(ladder: Ladder, index: int) -> bool:
     """Whether the noise is so faint that knots twice as far apart would not do, so that no fit on them is called for."""
-    if index < 2 or index == ladder.last or not ladder.problem.noise_is_stated or ladder.spare(index) < SPARE:
+    problem = ladder.problem
+    if index < 2 or index == ladder.last or not problem.noise_is_stated or ladder.spare(index) < SPARE:
         return False
-    added = ladder.grids[index].size - ladder.grids[index - 1].size
-    return ladder.detail(index) > worth(added, ladder.problem.data.size)
+    price = worth(ladder.grids[index].size - ladder.grids[index - 1].size, problem.data.size)
+    # No more than all of the films can be detail.
+    if ladder.foretold(index, float(np.sum(problem.fit_weights * problem.data**2))) < price:
+        return False
+    return ladder.foretold(index, ladder.detail(index)) > price

@@ -101,11 +101,18 @@ class Ladder:
     def closed(self, index: int) -> ClosedForm:
         """The closed form."""
         if index not in self._closed:
-            weighted, groups = self.problem.weighted(self.designs(index)), self.groups(index)
+            problem, groups = self.problem, self.groups(index)
             if len(groups) > 1:
-                made = closed_form_in_groups(self.problem.weighted_data, weighted, self.space, groups)
+                weighted = problem.weighted(self.designs(index))
+                made = closed_form_in_groups(problem.weighted_data, weighted, self.space, groups)
             else:
-                made = closed_form(self.problem.weighted_data, weighted, self.space, band=self.band(index))
+                made = closed_form(
+                    problem.weighted_data,
+                    self.designs(index),
+                    self.space,
+                    row_weights=problem.row_weights,
+                    band=self.band(index),
+                )
             self._closed[index] = made
         return self._closed[index]
 
@@ -121,7 +128,7 @@ class Ladder:
             if index in self._summed and self.problem.fit_weights.shape[1] == 1:
                 self._bands[index] = self._summed[index].pairs[0].band
             else:
-                self._bands[index] = banded_gram(self.problem.weighted(self.designs(index)))
+                self._bands[index] = banded_gram(self.designs(index), self.problem.row_weights)
         return self._bands[index]
 
     def smooth_band(self, index: int) -> Array:
@@ -240,17 +247,23 @@ class Ladder:
         return _nearest(self.grids[index - 1].in_halved(), r, self.summed(index).exposure)
 
     def detail(self, index: int) -> float:
-        """The misfit that knots twice as far apart would make of the closed form, as far as its own detail foretells it.
+        """The misfit that knots four times as far apart make of the closed form: nearly all error of their splines, not noise.
 
-        What it loses on knots four times as far apart is nearly all error of the spline, not noise, and that falls by
-        2^(degree + 1) with each halving for a smooth rho. Told before the grid's moments are made.
+        Told before the grid's moments are made.
         """
         closed, (coarse, fine) = self.closed(index), self.grids[index - 2 : index]
         prolongation = sp.csr_array(fine.in_halved() @ coarse.in_halved())
         r = closed.coefficients
         lost = r - prolongation @ _nearest(prolongation, r, closed.exposure)
         films = np.stack([t @ lost for t in self.designs(index)], axis=1) @ closed.source
-        return float(np.sum(self.problem.fit_weights * films**2)) / 4.0 ** (fine.degree + 1)
+        return float(np.sum(self.problem.fit_weights * films**2))
+
+    def foretold(self, index: int, detail: float) -> float:
+        """The misfit of knots twice as far apart, from that of knots four times as far apart: as for a smooth rho.
+
+        The error of its splines falls by 2^(degree + 1) with each halving of the knots.
+        """
+        return detail / 4.0 ** (self.grids[index].degree + 1)
 
 
 def _nearest(prolongation: sp.csr_array, r: Array, exposure: Array) -> Array:
