@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
@@ -73,6 +74,7 @@ def test_moments_of_coarse_knots_follow_from_those_of_finer_ones(columns: int) -
     weights = np.broadcast_to(10.0 ** np.random.default_rng(1).uniform(-1, 1, (data.shape[0], columns)), data.shape)
     there = moments(data, coarse, weights)  # type: ignore[arg-type]
     finer = moments(data, fine, weights)  # type: ignore[arg-type]
+    follows = finer.coarser(grid.in_halved())
     halved = grid.in_halved().toarray()
     r, v = np.random.default_rng(2).random(grid.size), np.random.default_rng(4).random((7, 3))
     band = finer.pairs[0].band
@@ -83,9 +85,17 @@ def test_moments_of_coarse_knots_follow_from_those_of_finer_ones(columns: int) -
         (halved.T @ finer.gram_of_source(v) @ halved, there.gram_of_source(v)),
         (finer.pairs[0].times(halved @ r) @ halved, there.pairs[0].times(r)),
         (np.diag(halved.T @ total @ halved), there.pairs[0].band[0]),
+        (follows.cross, there.cross),
+        (follows.gram_of_source(v), there.gram_of_source(v)),
+        (follows.pairs[-1].times(r), there.pairs[-1].times(r)),
+        (follows.pairs[0].band, there.pairs[0].band),
+        (follows.energy, there.energy),
     ]:
         np.testing.assert_allclose(a, b, atol=1e-13 * np.max(np.abs(b)), rtol=0)  # sums of some 400 rows
-    assert len(there.pairs) == columns
+    assert len(there.pairs) == len(follows.pairs) == columns
+    # The planted fault: coefficients of the coarser knots one knot aside.
+    aside = finer.coarser(sp.csr_array(np.roll(halved, 1, axis=0)))
+    assert np.max(np.abs(aside.cross - there.cross)) > 1e-3 * np.max(np.abs(there.cross))
 
 
 # -- the score test -------------------------------------------------------------------------------------------------

@@ -207,7 +207,8 @@ def _wants_detail(ladder: Ladder, index: int) -> bool:
     problem = ladder.problem
     if index < 2 or index == ladder.last or not problem.noise_is_stated or ladder.spare(index) < SPARE:
         return False
-    price = worth(ladder.grids[index].size - ladder.grids[index - 1].size, problem.data.size)
+    added = ladder.grids[index].size - ladder.grids[index - 1].size
+    price = worth(added, problem.data.size) - added  # of which noise pays so much in the mean
     # No more than all of the films can be detail.
     if ladder.foretold(index, float(np.sum(problem.fit_weights * problem.data**2))) < price:
         return False

@@ -93,7 +93,11 @@ class Ladder:
     def summed(self, index: int) -> Moments:
         """What the likelihood needs of the data."""
         if index not in self._summed:
-            made = moments(self.problem.data, self.designs(index), self.problem.inverse_variance)
+            if index + 1 < self.last and (index + 1 in self._summed or index + 2 < self.last):
+                # Every search that comes to the coarsest knots tries the next ones, of which theirs follow at once.
+                made = self.summed(index + 1).coarser(self.grids[index].in_halved())
+            else:
+                made = moments(self.problem.data, self.designs(index), self.problem.inverse_variance)
             groups = self.groups(index)
             self._summed[index] = replace(made, apart=groups.cells) if len(groups) > 1 else made
         return self._summed[index]
@@ -119,7 +123,12 @@ class Ladder:
     def groups(self, index: int) -> Groups:
         """The elements that share coefficients on these knots."""
         if index not in self._groups:
-            self._groups[index] = groups_of(self.designs(index))
+            finer = self._groups.get(index + 1)
+            if finer is not None and len(finer) == 1:  # broader splines are shared by no fewer
+                seen = self.grids[index].in_halved().T @ finer.cells.T.astype(np.float64) > 0
+                self._groups[index] = Groups(finer.elements, seen.T)
+            else:
+                self._groups[index] = groups_of(self.designs(index))
         return self._groups[index]
 
     def band(self, index: int) -> Array:

@@ -9,7 +9,7 @@ so that an iteration of a fit does not touch the pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -53,6 +53,11 @@ class Pairs:
         pointers = np.concatenate([[0], np.cumsum(entries)])
         above = sp.csr_array((values, columns + first, pointers), shape=(entries.size, entries.size))
         return cls(above, elements)
+
+    def coarser(self, halved: sp.csr_array) -> Pairs:
+        """R^T N_ij R for R of shape (K, K')."""
+        every = sp.csr_array(sp.kron(sp.eye_array(self.above.shape[0] // self.size), halved, format="csr"))
+        return Pairs(sp.csr_array(every.T.tocsr() @ (self.above @ every)), self.elements)
 
     @property
     def size(self) -> int:
@@ -159,6 +164,11 @@ class Moments:
     def seen(self) -> NDArray[np.bool_]:
         """Which coefficients the captures see at all, shape (K,)."""
         return np.asarray(self.exposure > LEAST_SEEN)
+
+    def coarser(self, halved: sp.csr_array) -> Moments:
+        """Those on knots twice as far apart, whose r is `halved` r on these knots, (K, K'); see `SplineGrid.in_halved`."""
+        cross = (self.cross.reshape(-1, self.size) @ halved).reshape(*self.cross.shape[:2], -1)
+        return replace(self, pairs=[pairs.coarser(halved) for pairs in self.pairs], cross=cross, apart=None)
 
     def gram_of_source(self, v: Array) -> Array:
         """sum_b J_b^T W J_b, dense (K, K), for v of shape (B, M)."""
