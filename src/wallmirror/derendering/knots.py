@@ -128,7 +128,7 @@ def refine(
         If fewer patterns than elements stand out of the noise, or no knots are coarse enough to be determined.
     """
     ladder = Ladder.of(problem, space, steps, tolerance)
-    begin = _first_worth_a_fit(ladder)
+    begin = _first_worth_a_fit(ladder, nonnegative)
     while True:
         try:
             fits, rival = climb(ladder, begin, nonnegative, tolerance, tell)
@@ -171,7 +171,7 @@ def _level(ladder: Ladder, index: int, free: Fit, nonnegative: bool) -> Level | 
     return level if math.isfinite(level.bound.source_error) else None
 
 
-def _first_worth_a_fit(ladder: Ladder) -> int:
+def _first_worth_a_fit(ladder: Ladder, nonnegative: bool) -> int:
     """Index of knots whose closed form misses the data's space by about what noise makes it miss, and is a start.
 
     Coarser ones are far from explaining the films, and a fit on them would only be a start for the next. Where finer ones
@@ -181,7 +181,7 @@ def _first_worth_a_fit(ladder: Ladder) -> int:
     if ladder.space.rank < ladder.problem.card.elements:
         return 0
     index = max(0, ladder.last - 2)
-    if _wants_detail(ladder, index + 1):
+    if _wants_detail(ladder, index + 1, nonnegative):
         index += 1
     else:
         ladder.summed(index)  # which nearly every search asks for, and of which the closed form makes use
@@ -202,14 +202,16 @@ def _first_worth_a_fit(ladder: Ladder) -> int:
     return 0
 
 
-def _wants_detail(ladder: Ladder, index: int) -> bool:
-    """Whether the noise is so faint that knots twice as far apart would not do, so that no fit on them is called for."""
+def _wants_detail(ladder: Ladder, index: int, nonnegative: bool) -> bool:
+    """Whether the noise is so faint that knots twice as far apart will hardly do, so that the search begins with these."""
     problem = ladder.problem
     if index < 2 or index == ladder.last or not problem.noise_is_stated or ladder.spare(index) < SPARE:
         return False
-    added = ladder.grids[index].size - ladder.grids[index - 1].size
-    price = worth(added, problem.data.size) - added  # of which noise pays so much in the mean
+    # Where rho >= 0 may leave all angles dark but for one lobe, these need to pay there alone.
+    grid, coarser = ladder.grids[index], ladder.grids[index - 1]
+    added = grid.degree + 1 if nonnegative else grid.size - coarser.size
+    excess = worth(added, problem.data.size) - added  # noise pays for the others in the mean
     # No more than all of the films can be detail.
-    if ladder.foretold(index, float(np.sum(problem.fit_weights * problem.data**2))) < price:
+    if ladder.foretold(index, float(np.sum(problem.fit_weights * problem.data**2))) < excess:
         return False
-    return ladder.foretold(index, ladder.detail(index)) > price
+    return ladder.foretold(index, ladder.detail(index)) > excess
