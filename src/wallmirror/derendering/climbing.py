@@ -53,6 +53,7 @@ def climb(
         return found
 
     index = begin
+    ladder.summed(index)  # of which the closed form makes use
     best = fit(index, ladder.closed(index).coefficients)
     rival: Other | None = None
     finer_fits: dict[int, Fit] = {}

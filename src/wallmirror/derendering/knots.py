@@ -182,7 +182,9 @@ def _first_worth_a_fit(ladder: Ladder, nonnegative: bool) -> int:
         return 0
     index = max(0, ladder.last - 2)
     if _wants_detail(ladder, index + 1, nonnegative):
-        index += 1
+        closed = ladder.closed(index + 1)
+        if not closed.mismatch > _FAR_OFF * expected_mismatch(ladder.problem, ladder.space, closed) and _starts(closed):
+            return index + 1
     else:
         ladder.summed(index)  # which nearly every search asks for, and of which the closed form makes use
     closed = ladder.closed(index)
@@ -190,7 +192,7 @@ def _first_worth_a_fit(ladder: Ladder, nonnegative: bool) -> int:
     if math.isnan(expected):
         return 0
     if not closed.mismatch > _FAR_OFF * expected:
-        return index if closed.gap > _GAP * closed.mismatch and closed.error < _START else 0
+        return index if _starts(closed) else 0
     for finer in range(index + 1, ladder.last + 1):
         if closed.gap < _GAP * closed.mismatch:
             break
@@ -200,6 +202,11 @@ def _first_worth_a_fit(ladder: Ladder, nonnegative: bool) -> int:
         if closed.mismatch > _ALIKE * coarser.mismatch:
             return finer - 1 if coarser.error < _START else 0
     return 0
+
+
+def _starts(closed: ClosedForm) -> bool:
+    """Whether a closed form whose mismatch is noise is near enough to the answer for a fit to begin there."""
+    return closed.gap > _GAP * closed.mismatch and closed.error < _START
 
 
 def _wants_detail(ladder: Ladder, index: int, nonnegative: bool) -> bool:
