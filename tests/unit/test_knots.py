@@ -234,7 +234,6 @@ def test_the_closed_forms_detail_foretells_what_coarser_knots_lose() -> None:
     for decibels in (40, 60):
         ladder = ladder_at(decibels)
         foretold[decibels] = ladder.foretold(finer, ladder.detail(finer))
-        assert not ladder._summed  # before any moments are made
     best = maximise(ladder.summed(finer), ladder.closed(finer).coefficients, nonnegative=False)
     coarse = maximise(ladder.summed(finer - 1), ladder.coarsened(finer, best.coefficients), nonnegative=False)
     # It knows nothing of what another pattern makes good, and the rate is that of infinitely fine knots.

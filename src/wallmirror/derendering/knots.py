@@ -25,7 +25,7 @@ from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.problem import Problem, expected_mismatch, too_few_patterns
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace
-from wallmirror.errors import UndeterminedError
+from wallmirror.errors import InputError, UndeterminedError
 
 Array = NDArray[np.float64]
 
@@ -185,8 +185,7 @@ def _first_worth_a_fit(ladder: Ladder, nonnegative: bool) -> int:
         closed = ladder.closed(index + 1)
         if not closed.mismatch > _FAR_OFF * expected_mismatch(ladder.problem, ladder.space, closed) and _starts(closed):
             return index + 1
-    else:
-        ladder.summed(index)  # which nearly every search asks for, and of which the closed form makes use
+    ladder.summed(index)  # which nearly every search asks for, and of which the closed form makes use
     closed = ladder.closed(index)
     expected = expected_mismatch(ladder.problem, ladder.space, closed)
     if math.isnan(expected):
@@ -220,5 +219,9 @@ def _wants_detail(ladder: Ladder, index: int, nonnegative: bool) -> bool:
     excess = worth(added, problem.data.size) - added  # noise pays for the others in the mean
     # No more than all of the films can be detail.
     if ladder.foretold(index, float(np.sum(problem.fit_weights * problem.data**2))) < excess:
+        return False
+    try:
+        ladder.summed(index)  # from which those of coarser knots follow, whichever the search begins with
+    except InputError:  # the memory does not hold them
         return False
     return ladder.foretold(index, ladder.detail(index)) > excess

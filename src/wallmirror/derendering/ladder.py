@@ -256,10 +256,7 @@ class Ladder:
         return _nearest(self.grids[index - 1].in_halved(), r, self.summed(index).exposure)
 
     def detail(self, index: int) -> float:
-        """The misfit that knots four times as far apart make of the closed form: nearly all error of their splines, not noise.
-
-        Told before the grid's moments are made.
-        """
+        """The misfit of knots four times as far apart by the closed form: nearly all error of their splines, not noise."""
         closed, (coarse, fine) = self.closed(index), self.grids[index - 2 : index]
         prolongation = sp.csr_array(fine.in_halved() @ coarse.in_halved())
         r = closed.coefficients
