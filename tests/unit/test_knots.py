@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
@@ -19,7 +20,10 @@ from wallmirror.captures import CaptureSet
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.finer import Films, Finer, loss, score, worth
 from wallmirror.derendering.information import information
+from wallmirror.derendering.knots import NOISY_STEPS
+from wallmirror.derendering.ladder import Ladder
 from wallmirror.derendering.likelihood import Fit, maximise, moments
+from wallmirror.derendering.problem import prepare
 from wallmirror.derendering.solve import solve
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
 from wallmirror.derendering.subspace import banded_gram
@@ -70,6 +74,7 @@ def test_moments_of_coarse_knots_follow_from_those_of_finer_ones(columns: int) -
     weights = np.broadcast_to(10.0 ** np.random.default_rng(1).uniform(-1, 1, (data.shape[0], columns)), data.shape)
     there = moments(data, coarse, weights)  # type: ignore[arg-type]
     finer = moments(data, fine, weights)  # type: ignore[arg-type]
+    follows = finer.coarser(grid.in_halved())
     halved = grid.in_halved().toarray()
     r, v = np.random.default_rng(2).random(grid.size), np.random.default_rng(4).random((7, 3))
     band = finer.pairs[0].band
@@ -80,9 +85,17 @@ def test_moments_of_coarse_knots_follow_from_those_of_finer_ones(columns: int) -
         (halved.T @ finer.gram_of_source(v) @ halved, there.gram_of_source(v)),
         (finer.pairs[0].times(halved @ r) @ halved, there.pairs[0].times(r)),
         (np.diag(halved.T @ total @ halved), there.pairs[0].band[0]),
+        (follows.cross, there.cross),
+        (follows.gram_of_source(v), there.gram_of_source(v)),
+        (follows.pairs[-1].times(r), there.pairs[-1].times(r)),
+        (follows.pairs[0].band, there.pairs[0].band),
+        (follows.energy, there.energy),
     ]:
         np.testing.assert_allclose(a, b, atol=1e-13 * np.max(np.abs(b)), rtol=0)  # sums of some 400 rows
-    assert len(there.pairs) == columns
+    assert len(there.pairs) == len(follows.pairs) == columns
+    # The planted fault: coefficients of the coarser knots one knot aside.
+    aside = finer.coarser(sp.csr_array(np.roll(halved, 1, axis=0)))
+    assert np.max(np.abs(aside.cross - there.cross)) > 1e-3 * np.max(np.abs(there.cross))
 
 
 # -- the score test -------------------------------------------------------------------------------------------------
@@ -200,6 +213,51 @@ def test_what_coarser_knots_lose_is_foretold(columns: int) -> None:
     assert lost == pytest.approx(least.objective - best.objective, rel=0.1)
     # The planted fault: with nothing to hold the scale, nothing would seem lost.
     assert loss(schur, best.coefficients, 1e-9 * pull, halved) < 1e-3 * lost
+
+
+def ladder_at(decibels: float) -> Ladder:
+    """Thesis-like captures of narrow lobes, in noise that is stated."""
+    observer, card = thesis_observer(500, 8), thesis_card(4)
+    source = np.random.default_rng(5).random((4, 9))
+    films = radiance(transport_matrix(observer, card, lobes(sigma_deg=1), weights="cosine"), source)
+    noise = float(np.sqrt(np.mean(films**2))) * 10 ** (-decibels / 20)
+    films = films + noise * np.random.default_rng(1).standard_normal(films.shape)
+    variance = np.full(films.shape, noise**2)
+    captures = CaptureSet(observer=observer, card=card, transport="cosine", radiance=films, variance=variance)
+    problem, space = prepare(captures)
+    return Ladder.of(problem, space, NOISY_STEPS, None)
+
+
+def test_the_closed_forms_detail_foretells_what_coarser_knots_lose() -> None:
+    finer = NOISY_STEPS.index(0.5)
+    foretold = {}
+    for decibels in (40, 60):
+        ladder = ladder_at(decibels)
+        foretold[decibels] = ladder.foretold(finer, ladder.detail(finer))
+    best = maximise(ladder.summed(finer), ladder.closed(finer).coefficients, nonnegative=False)
+    coarse = maximise(ladder.summed(finer - 1), ladder.coarsened(finer, best.coefficients), nonnegative=False)
+    # It knows nothing of what another pattern makes good, and the rate is that of infinitely fine knots.
+    assert 0.5 < foretold[60] / (coarse.objective - best.objective) < 4
+    # In units of the noise: 20 dB are a factor of 100, less what noise adds to the closed form's detail.
+    assert foretold[60] / foretold[40] == pytest.approx(100, rel=0.3)
+
+
+def test_what_stands_for_a_band_leads_the_search_as_well() -> None:
+    ladder = ladder_at(40)
+    coarse, fine = NOISY_STEPS.index(1.0), NOISY_STEPS.index(0.5)
+    best = maximise(ladder.summed(coarse), ladder.closed(coarse).coefficients, nonnegative=False)
+    transport = np.stack([t @ best.coefficients for t in ladder.designs(coarse)], axis=1)
+    films = Films(ladder.problem.data, ladder.problem.fit_weights, transport, best.source)
+    free = np.ones(ladder.grids[fine].size, dtype=bool)
+    smooth, exact = ladder.smooth_band(fine), ladder.band(fine)
+    np.testing.assert_allclose(smooth[0], exact[0], rtol=1e4 * EPS)
+    diagonal = np.zeros_like(exact)
+    diagonal[0] = exact[0]
+    gains = [score(films, ladder.designs(fine), band, free, enough=math.inf) for band in (smooth, exact, diagonal)]
+    # A search ends at a part in a hundred of what there is.
+    assert gains[0].gain == pytest.approx(gains[1].gain, rel=0.02)
+    # The twin: with the diagonal alone the same steps are left behind.
+    assert gains[2].gain < 0.98 * gains[1].gain
 
 
 def test_the_price_allows_for_noise_that_few_data_tell() -> None:

@@ -15,7 +15,7 @@ from wallmirror.captures import CaptureSet
 from wallmirror.derendering import problem, splines
 from wallmirror.derendering.problem import prepare
 from wallmirror.derendering.solve import solve
-from wallmirror.derendering.subspace import space_within
+from wallmirror.derendering.span import space_within
 from wallmirror.geometry import Observer
 from wallmirror.pathtracing.filming import render_captures, render_one_hot
 from wallmirror.scene import load_scene

@@ -13,8 +13,9 @@ import scipy.stats
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from wallmirror.derendering.span import Span, space_within
 from wallmirror.derendering.splines import design_matrices, grid_for
-from wallmirror.derendering.subspace import noise_edge, signal_space, space_within
+from wallmirror.derendering.subspace import noise_edge, signal_space
 from wallmirror.transport import build_kernel
 
 from .helpers import lobes, thesis_card, thesis_observer
@@ -145,6 +146,39 @@ def test_the_projection_leaves_the_films_themselves_alone() -> None:
     grid = grid_for(kernel, step=np.radians(4), degree=3)
     other = space_within(films, design_matrices(kernel, grid), ELEMENTS, noise=None)
     assert angle(other.basis) > 1e-4
+
+
+def test_coarser_knots_follow_from_finer_ones() -> None:
+    kernel = build_kernel(thesis_observer(200, 8), thesis_card(ELEMENTS), weights="cosine")
+    coarse = grid_for(kernel, step=np.radians(4), degree=3)
+    data, halved = noisy(0.2, 0), coarse.in_halved()
+    direct = space_within(data, design_matrices(kernel, coarse), ELEMENTS, noise=0.2)
+    fine = Span.of(data, design_matrices(kernel, coarse.halved()))
+    inherited = fine.coarser(halved).space(ELEMENTS, noise=0.2)
+    assert (inherited.rank, inherited.dimensions) == (direct.rank, direct.dimensions)
+    # Both know the span's weakest directions to 2e-16 / 1e-10.
+    np.testing.assert_allclose(inherited.singular_values, direct.singular_values, rtol=1e-5)
+    assert np.max(sl.subspace_angles(inherited.basis, direct.basis)) < 1e-4
+    assert fine.space(ELEMENTS, noise=0.2).dimensions > direct.dimensions
+    # The planted fault: coefficients of coarser knots that are put one knot aside.
+    shifted = fine.coarser(sp.csr_array(np.roll(halved.toarray(), 1, axis=0))).space(ELEMENTS, noise=0.2)
+    assert np.max(np.abs(shifted.singular_values / direct.singular_values - 1)) > 1e-3
+
+
+def test_a_span_of_more_columns_than_are_pivoted_together_keeps_the_films() -> None:
+    kernel = build_kernel(thesis_observer(200, 8), thesis_card(ELEMENTS), weights="cosine")
+    designs = design_matrices(kernel, grid_for(kernel, step=np.radians(1), degree=3))
+    assert sum(t.shape[1] for t in designs) > 2 * 256
+    data = noisy(0.2, 0)
+    within = space_within(data, designs, ELEMENTS, noise=0.2)
+    # Any basis of the columns down to 1e-5 of the longest holds what the strongest directions have of the films.
+    left, strength, _ = np.linalg.svd(sp.hstack(designs).toarray(), full_matrices=False)
+    strong, all_of_it = left[:, strength > 1e-3 * strength[0]], left[:, strength > 1e-9 * strength[0]]
+    least, most = (np.linalg.svd(q.T @ data, compute_uv=False) for q in (strong, all_of_it))
+    assert np.all(least <= within.singular_values * (1 + 1e-6))
+    assert np.all(within.singular_values <= most * (1 + 1e-6))
+    assert strong.shape[1] <= within.dimensions <= all_of_it.shape[1]
+    np.testing.assert_allclose(within.basis.T @ within.basis, np.eye(ELEMENTS), rtol=0, atol=1e-6)
 
 
 def orthonormal(strengths: tuple[float, ...], sigma: float, seed: int) -> tuple[Array, list[sp.csr_array]]:

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
+from wallmirror.derendering.splines import SplineGrid, design_matrices, exposures, grid_for
 from wallmirror.geometry import Card, Observer
 from wallmirror.transport import Kernel, Weights, build_kernel
 
@@ -78,6 +78,29 @@ def test_a_spline_of_another_degree_or_shift_is_another_function() -> None:
     u = places(grid)
     moved = SplineGrid(start=-1.0 + 0.02, step=0.2, intervals=9, degree=3)
     assert np.max(np.abs(grid.evaluate(r, u) - scipy_spline(moved, r)(u))) > 0.05
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_overlaps_are_inner_products(degree: int) -> None:
+    grid = SplineGrid(start=-0.3, step=0.07, intervals=4 * degree + 2, degree=degree)
+    # Gauss-Legendre with degree + 1 nodes an interval is exact for products of two splines.
+    nodes, weights = np.polynomial.legendre.leggauss(degree + 1)
+    u = grid.start + grid.step * (np.arange(grid.intervals)[:, None] + 0.5 * (1 + nodes)).ravel()
+    first, values = grid.basis(u)
+    rows = np.zeros((u.size, grid.size))
+    rows[np.arange(u.size)[:, None], first[:, None] + np.arange(degree + 1)] = values.T
+    gram = (rows.T * np.tile(weights, grid.intervals)) @ rows
+    middle = grid.size // 2 - degree // 2 - 1  # all of it and its neighbours above lies within the grid
+    beside = gram[middle, middle : middle + degree + 1] / gram[middle, middle]
+    np.testing.assert_allclose(grid.overlaps(), beside, atol=100 * EPS, rtol=0)
+
+
+def test_exposures_are_squares_summed_over_the_pixels() -> None:
+    kernel = build_kernel(thesis_observer(40, 3), thesis_card(2), weights="cosine")
+    designs = design_matrices(kernel, grid_for(kernel, step=math.radians(4), degree=3))
+    weights = np.random.default_rng(0).random(120)
+    dense = np.stack([t.toarray() for t in designs])
+    np.testing.assert_allclose(exposures(designs, weights), np.einsum("p,ipk->ik", weights, dense**2), rtol=120 * EPS)
 
 
 def test_outside_the_grid_the_reflectance_is_zero() -> None:

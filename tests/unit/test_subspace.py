@@ -230,11 +230,28 @@ def test_the_band_is_that_of_the_dense_gram_matrix(columns: list[list[int]]) -> 
     # Planted fault: taking every matrix with rows of equal length for runs of columns, without a look at where they are,
     # fails for both kinds of gaps and for columns out of order. The second matrix of the pair has runs of another length.
     designs = [rows_at(columns, 6, 1), rows_at([[0, 1], [4, 5], [2, 3], [1, 2]], 6, 2)]
-    gram = sum(t.toarray().T @ t.toarray() for t in designs)
-    band = banded_gram(designs)
-    for d in range(6):
-        found = band[d, : 6 - d] if d < band.shape[0] else np.zeros(6 - d)
-        np.testing.assert_allclose(found, np.diagonal(gram, -d), rtol=0, atol=1e-14)  # ten products of order one
+    for weights in (None, np.random.default_rng(3).random((4, 1))):
+        gram = sum(np.square(1.0 if weights is None else weights).T * t.toarray().T @ t.toarray() for t in designs)
+        band = banded_gram(designs, weights)
+        for d in range(6):
+            found = band[d, : 6 - d] if d < band.shape[0] else np.zeros(6 - d)
+            np.testing.assert_allclose(found, np.diagonal(gram, -d), rtol=0, atol=1e-14)  # ten products of order one
+
+
+def test_rows_weighted_on_the_way_are_rows_weighted_before() -> None:
+    observer, card, source = thesis_observer(), thesis_card(), patterns()
+    kernel = build_kernel(observer, card, weights="thesis")
+    designs = design_matrices(kernel, grid_for(kernel, step=np.radians(1), degree=7))
+    data = radiance(transport_matrix(observer, card, lobes(), weights="thesis"), source).reshape(-1, source.shape[1])
+    weights = np.random.default_rng(0).uniform(0.5, 2, (data.shape[0], 1))
+    space = signal_space(weights * data, card.elements)
+    before = closed_form(weights * data, [sp.csr_array(t.multiply(weights)) for t in designs], space)
+    within = closed_form(weights * data, designs, space, row_weights=weights)
+    # To the rounding of the eigenproblem, relative to the gap.
+    assert up_to_scale(within.source, before.source) < 1e-9
+    assert within.mismatch == pytest.approx(before.mismatch, rel=1e-6)
+    # The planted fault: weights that the designs do not get.
+    assert up_to_scale(closed_form(weights * data, designs, space).source, before.source) > 1e-3
 
 
 @pytest.mark.parametrize("factor", [1.01, 0.99])

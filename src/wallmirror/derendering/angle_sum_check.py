@@ -24,7 +24,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import f as f_distribution
@@ -177,18 +176,20 @@ def _derivatives(
         part = np.where(mine, r, 0.0)[cells]
         schur += level * np.outer(part, part) / max(float(part @ part), 1e-300)
     schur[np.diag_indices_from(schur)] += _RIDGE * level
-    lit = kernel.weight * grid.evaluate(r, kernel.angle_sum)
-    # The change of F, (P, M), and that of the films as J and F see them: T_i^T W m_b, (B, M, K).
+    if kernel.weight.shape[-1] == 1:  # what a pixel's only node sends is F
+        lit = estimate.transport.reshape(kernel.weight.shape)
+    else:
+        lit = kernel.weight * grid.evaluate(r, kernel.angle_sum)
     changes = [
         np.sum(lit * logarithm(k, kernel.theta_s, kernel.theta_o), axis=-1).reshape(estimate.transport.shape)
         for k in factors
     ]
-    backs = [_back(designs, weights, change, source) for change in changes]
-    along_v = [back @ r for back in backs]
-    right = [
-        np.einsum("ib,bik->k", source, back)[cells] - np.einsum("bmk,bm->k", known.coupled, along)
-        for back, along in zip(backs, along_v, strict=True)
-    ]
+    along_v, right = [], []
+    for change in changes:  # of F, (P, M): that of the films as V and r see them, F^T W m_b and sum_b J_b^T W m_b
+        weighted = weights * (change @ source)
+        along_v.append((estimate.transport.T @ weighted).T)
+        along_r = sum(t.T @ column for t, column in zip(designs, source @ weighted.T, strict=True))
+        right.append(along_r[cells] - np.einsum("bmk,bm->k", known.coupled, along_v[-1]))
     steps = np.zeros((len(factors), r.size))
     steps[:, cells] = solve_positive(schur, np.stack(right, axis=1)).T
     unexplained, turns = [], []
@@ -206,16 +207,6 @@ def _derivatives(
 def _alike(weights: Array, others: Array) -> bool:
     """Whether two kinds of weights are the same but for the rounding of an average."""
     return weights.shape == others.shape and bool(np.all(np.abs(weights - others) <= _ROUNDING * others))
-
-
-def _back(designs: list[sp.csr_array], weights: Array, change: Array, source: Array) -> Array:
-    """T_i^T W_b (dF v_b), shape (B, M, K)."""
-    if weights.shape[1] > 1:
-        weighted = weights * (change @ source)
-        return np.stack([(t.T @ weighted).T for t in designs], axis=1)
-    # Where all realisations share their weights, M columns do for B.
-    few = np.stack([(t.T @ (weights * change)).T for t in designs], axis=1)
-    return np.asarray(np.tensordot(source.T, few, axes=1))
 
 
 def in_words(exponents: Mapping[Any, float]) -> str:

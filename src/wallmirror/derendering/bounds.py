@@ -138,7 +138,8 @@ def bound_of(
     def factor(ridge: float) -> Array:
         raised = pinned.copy()
         raised[np.diag_indices_from(raised)] += ridge
-        return np.asarray(sl.cholesky(raised, lower=True, overwrite_a=True, check_finite=False))
+        # What lies above the diagonal is left as it may be: to clear it takes longer than to factorise.
+        return np.asarray(sl.cho_factor(raised, lower=True, overwrite_a=True, check_finite=False)[0])
 
     lower, sound = None, informed and lost <= 1e-3
     while lower is None:

@@ -26,7 +26,7 @@ Tell = Callable[[str], None]
 # Share of a tolerance below which a move of the pattern is none.
 _SETTLED = 0.25
 # So many times more than noise explains must coarser knots lose by a quadratic guess for no fit to be tried on them.
-_HOPELESS = 10.0
+_HOPELESS = 2.0
 # Share of the BRDF's largest coefficient above which one is lit, of the best-seen one's information above which that one
 # counts, and of lit coefficients up to which rho is sparse.
 _LIT = 0.01
@@ -53,6 +53,7 @@ def climb(
         return found
 
     index = begin
+    ladder.summed(index)  # of which the closed form makes use
     best = fit(index, ladder.closed(index).coefficients)
     rival: Other | None = None
     finer_fits: dict[int, Fit] = {}
@@ -62,6 +63,12 @@ def climb(
         # Against each of the finer ones: steps of which none loses much may lose much together.
         losses = ((finer, each, coarser.objective - each.objective) for finer, each in finer_fits.items())
         if any(loss >= ladder.price(index - 1, finer, each) for finer, each, loss in losses):
+            break
+        if (
+            nonnegative
+            and index >= ladder.last - 1
+            and _in_the_light(ladder, index - 1, coarser, index, tell) is not None
+        ):
             break
         rival = Other(best.source, best.objective)
         index, best = index - 1, coarser
@@ -94,12 +101,14 @@ def climb(
 
 def _needed(ladder: Ladder, index: int, fit: Fit, tell: Tell) -> bool:
     """Whether coarser knots than a fit's would miss so much more than noise does that no fit on them is called for."""
-    summed, halved = ladder.summed(index), ladder.grids[index - 1].in_halved()
+    summed = ladder.summed(index)
+    halved = sp.csr_array(ladder.grids[index - 1].in_halved()[summed.seen])
     schur = information(summed, fit.coefficients, fit.source, fit.schur).schur
     pull = np.einsum("ib,bik->k", fit.source, summed.cross)[summed.seen]
-    lost = loss(schur, fit.coefficients[summed.seen], pull, sp.csr_array(halved[summed.seen]))
+    lost = loss(schur, fit.coefficients[summed.seen], pull, halved)
     freedom = ladder.freedom(index)
-    if lost < _HOPELESS * worth(ladder.seen(index), freedom) * ladder.variance(fit.objective, freedom):
+    saved = max(1, halved.shape[0] - int(np.count_nonzero(halved.sum(axis=0))))
+    if lost < _HOPELESS * worth(saved, freedom) * ladder.variance(fit.objective, freedom):
         return False
     tell(f"knots every {math.degrees(ladder.grids[index - 1].step):g} deg would raise it by about {lost:.4g}")
     return True
@@ -125,18 +134,22 @@ def _finer(
     found, price = _tested(ladder, index, best, finer, every, ladder.seen(index), tell)
     if found.gain >= price:
         return _paying(ladder, index, best, finer, fit(finer, start + found.step, start))
-    if nonnegative:
-        within = ladder.bounded(index, best)
-        lit = within.coefficients > _LIT * float(
-            np.max(within.coefficients[ladder.summed(index).exposure > _WELL_SEEN])
-        )
-        free = ladder.refined(index, lit.astype(np.float64), finer) > 0
-        if np.count_nonzero(free) < _SPARSE * free.size:
-            of_lit, its_price = _tested(ladder, index, within, finer, free, int(np.count_nonzero(lit)), tell)
-            if of_lit.gain >= its_price:
-                trial = fit(finer, start + found.step, start)
-                return trial, Other(trial.source, trial.objective)
+    lit = _in_the_light(ladder, index, best, finer, tell) if nonnegative else None
+    if lit is not None:
+        trial = fit(finer, start + lit.step, start)
+        return trial, Other(trial.source, trial.objective)
     return None, _stepped(ladder, finer, start + found.step)
+
+
+def _in_the_light(ladder: Ladder, index: int, best: Fit, finer: int, tell: Tell) -> Finer | None:
+    """What finer knots gain where rho >= 0 is lit, if it leaves most of the angles dark and the gain is worth them."""
+    within = ladder.bounded(index, best)
+    lit = within.coefficients > _LIT * float(np.max(within.coefficients[ladder.summed(index).exposure > _WELL_SEEN]))
+    free = ladder.refined(index, lit.astype(np.float64), finer) > 0
+    if np.count_nonzero(free) >= _SPARSE * free.size:
+        return None
+    found, price = _tested(ladder, index, within, finer, free, int(np.count_nonzero(lit)), tell)
+    return found if found.gain >= price else None
 
 
 def _paying(ladder: Ladder, index: int, best: Fit, finer: int, trial: Fit) -> tuple[Fit | None, Other]:
@@ -161,7 +174,7 @@ def _tested(
     found = score(
         films,
         ladder.designs(finer),
-        ladder.band(finer),
+        ladder.smooth_band(finer),
         free,
         enough=enough,
         # From the maximum a search finds less with each step; from a fit that bounds hold elsewhere it may find most late.

@@ -125,7 +125,8 @@ def score(
     designs:
         T_1 .. T_M on the finer knots, (P, K).
     band:
-        Lower band of sum_i T_i^T W T_i, as `banded_gram` makes it: with the pattern's mean power it stands for S.
+        Lower band of sum_i T_i^T W T_i, as `banded_gram` makes it, or one alike with that diagonal: with the pattern's mean
+        power it stands for S.
     free:
         Coefficients that may move, shape (K,); those among them that the captures do not see are left alone.
     enough:

@@ -137,22 +137,23 @@ def schur_complement(
 ) -> Array:
     """S on the given cells, for H_b^-1 as `inverses` gives them."""
     m = data.elements
-    schur = data.gram_of_source(point.v)
-    if cells.size < data.size:
-        schur = schur[np.ix_(cells, cells)]
+    # Cells that are neighbours, as the seen ones mostly are, need not be picked one by one.
+    beside = cells.size > 0 and int(cells[-1] - cells[0]) == cells.size - 1
+    kept = slice(int(cells[0]), int(cells[-1]) + 1) if beside else cells
+    schur = data.gram_of_source(point.v)[kept][:, kept]
     whole = np.all(free, axis=1)
     for g, pair in enumerate(point.pair):
         alike = np.flatnonzero((data.group == g) & whole)
         # One H for all of these: sum_b C_b^T H^-1 C_b hangs on V V^T alone, so that M columns do for B.
         few = point.v[alike] if alike.size <= m else np.linalg.qr(point.v[alike], mode="r")
-        coupling = (few @ pair.reshape(m, -1)).reshape(-1, m, data.size)[..., cells]
+        coupling = (few @ pair.reshape(m, -1)).reshape(-1, m, data.size)[..., kept]
         values, vectors = np.linalg.eigh(point.normal[g])
         root = vectors / np.sqrt(np.maximum(values, max(1e-14 * float(np.sum(values)), _LEAST)))
         half = (root.T @ coupling).reshape(-1, cells.size)
         schur -= half.T @ half
     bound = np.flatnonzero(~whole)
     if bound.size:
-        coupling = _coupling(data, point)[bound][..., cells]
+        coupling = _coupling(data, point)[bound][..., kept]
         schur -= coupling.reshape(-1, cells.size).T @ (inverse[bound] @ coupling).reshape(-1, cells.size)
     return 0.5 * (schur + schur.T)
 

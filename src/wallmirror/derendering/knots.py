@@ -16,15 +16,16 @@ from numpy.typing import NDArray
 
 from wallmirror.derendering.bounds import Bound, bound_of
 from wallmirror.derendering.climbing import Other, Tell, climb
+from wallmirror.derendering.finer import worth
 from wallmirror.derendering.groups import Groups
 from wallmirror.derendering.information import Information, information
-from wallmirror.derendering.ladder import Ladder
+from wallmirror.derendering.ladder import SPARE, Ladder
 from wallmirror.derendering.likelihood import Fit, maximise
 from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.problem import Problem, expected_mismatch, too_few_patterns
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace
-from wallmirror.errors import UndeterminedError
+from wallmirror.errors import InputError, UndeterminedError
 
 Array = NDArray[np.float64]
 
@@ -127,7 +128,7 @@ def refine(
         If fewer patterns than elements stand out of the noise, or no knots are coarse enough to be determined.
     """
     ladder = Ladder.of(problem, space, steps, tolerance)
-    begin = _first_worth_a_fit(ladder)
+    begin = _first_worth_a_fit(ladder, nonnegative)
     while True:
         try:
             fits, rival = climb(ladder, begin, nonnegative, tolerance, tell)
@@ -170,7 +171,7 @@ def _level(ladder: Ladder, index: int, free: Fit, nonnegative: bool) -> Level | 
     return level if math.isfinite(level.bound.source_error) else None
 
 
-def _first_worth_a_fit(ladder: Ladder) -> int:
+def _first_worth_a_fit(ladder: Ladder, nonnegative: bool) -> int:
     """Index of knots whose closed form misses the data's space by about what noise makes it miss, and is a start.
 
     Coarser ones are far from explaining the films, and a fit on them would only be a start for the next. Where finer ones
@@ -180,13 +181,17 @@ def _first_worth_a_fit(ladder: Ladder) -> int:
     if ladder.space.rank < ladder.problem.card.elements:
         return 0
     index = max(0, ladder.last - 2)
+    if _wants_detail(ladder, index + 1, nonnegative):
+        closed = ladder.closed(index + 1)
+        if not closed.mismatch > _FAR_OFF * expected_mismatch(ladder.problem, ladder.space, closed) and _starts(closed):
+            return index + 1
     ladder.summed(index)  # which nearly every search asks for, and of which the closed form makes use
     closed = ladder.closed(index)
     expected = expected_mismatch(ladder.problem, ladder.space, closed)
     if math.isnan(expected):
         return 0
     if not closed.mismatch > _FAR_OFF * expected:
-        return index if closed.gap > _GAP * closed.mismatch and closed.error < _START else 0
+        return index if _starts(closed) else 0
     for finer in range(index + 1, ladder.last + 1):
         if closed.gap < _GAP * closed.mismatch:
             break
@@ -196,3 +201,27 @@ def _first_worth_a_fit(ladder: Ladder) -> int:
         if closed.mismatch > _ALIKE * coarser.mismatch:
             return finer - 1 if coarser.error < _START else 0
     return 0
+
+
+def _starts(closed: ClosedForm) -> bool:
+    """Whether a closed form whose mismatch is noise is near enough to the answer for a fit to begin there."""
+    return closed.gap > _GAP * closed.mismatch and closed.error < _START
+
+
+def _wants_detail(ladder: Ladder, index: int, nonnegative: bool) -> bool:
+    """Whether the noise is so faint that knots twice as far apart will hardly do, so that the search begins with these."""
+    problem = ladder.problem
+    if index < 2 or index == ladder.last or not problem.noise_is_stated or ladder.spare(index) < SPARE:
+        return False
+    # Where rho >= 0 may leave all angles dark but for one lobe, these need to pay there alone.
+    grid, coarser = ladder.grids[index], ladder.grids[index - 1]
+    added = grid.degree + 1 if nonnegative else grid.size - coarser.size
+    excess = worth(added, problem.data.size) - added  # noise pays for the others in the mean
+    # No more than all of the films can be detail.
+    if ladder.foretold(index, float(np.sum(problem.fit_weights * problem.data**2))) < excess:
+        return False
+    try:
+        ladder.summed(index)  # from which those of coarser knots follow, whichever the search begins with
+    except InputError:  # the memory does not hold them
+        return False
+    return ladder.foretold(index, ladder.detail(index)) > excess

@@ -18,7 +18,7 @@ from wallmirror.derendering.groups import Groups, closed_form_in_groups, groups_
 from wallmirror.derendering.likelihood import Fit, best_nonnegative, maximise
 from wallmirror.derendering.moments import Moments, moments
 from wallmirror.derendering.problem import Problem
-from wallmirror.derendering.splines import SplineGrid, design_matrices
+from wallmirror.derendering.splines import SplineGrid, design_matrices, exposures
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, banded_gram, closed_form
 from wallmirror.errors import UndeterminedError
 from wallmirror.transport import Kernel
@@ -53,6 +53,7 @@ class Ladder:
     _designs: dict[int, list[sp.csr_array]] = field(default_factory=dict)
     _summed: dict[int, Moments] = field(default_factory=dict)
     _bands: dict[int, Array] = field(default_factory=dict)
+    _smooth_bands: dict[int, Array] = field(default_factory=dict)
     _groups: dict[int, Groups] = field(default_factory=dict)
     _closed: dict[int, ClosedForm] = field(default_factory=dict)
     _free: dict[int, Fit] = field(default_factory=dict)
@@ -92,7 +93,11 @@ class Ladder:
     def summed(self, index: int) -> Moments:
         """What the likelihood needs of the data."""
         if index not in self._summed:
-            made = moments(self.problem.data, self.designs(index), self.problem.inverse_variance)
+            if index + 1 < self.last and (index + 1 in self._summed or index + 2 < self.last):
+                # Every search that comes to the coarsest knots tries the next ones, of which theirs follow at once.
+                made = self.summed(index + 1).coarser(self.grids[index].in_halved())
+            else:
+                made = moments(self.problem.data, self.designs(index), self.problem.inverse_variance)
             groups = self.groups(index)
             self._summed[index] = replace(made, apart=groups.cells) if len(groups) > 1 else made
         return self._summed[index]
@@ -100,18 +105,30 @@ class Ladder:
     def closed(self, index: int) -> ClosedForm:
         """The closed form."""
         if index not in self._closed:
-            weighted, groups = self.problem.weighted(self.designs(index)), self.groups(index)
+            problem, groups = self.problem, self.groups(index)
             if len(groups) > 1:
-                made = closed_form_in_groups(self.problem.weighted_data, weighted, self.space, groups)
+                weighted = problem.weighted(self.designs(index))
+                made = closed_form_in_groups(problem.weighted_data, weighted, self.space, groups)
             else:
-                made = closed_form(self.problem.weighted_data, weighted, self.space, band=self.band(index))
+                made = closed_form(
+                    problem.weighted_data,
+                    self.designs(index),
+                    self.space,
+                    row_weights=problem.row_weights,
+                    band=self.band(index),
+                )
             self._closed[index] = made
         return self._closed[index]
 
     def groups(self, index: int) -> Groups:
         """The elements that share coefficients on these knots."""
         if index not in self._groups:
-            self._groups[index] = groups_of(self.designs(index))
+            finer = self._groups.get(index + 1)
+            if finer is not None and len(finer) == 1:  # broader splines are shared by no fewer
+                seen = self.grids[index].in_halved().T @ finer.cells.T.astype(np.float64) > 0
+                self._groups[index] = Groups(finer.elements, seen.T)
+            else:
+                self._groups[index] = groups_of(self.designs(index))
         return self._groups[index]
 
     def band(self, index: int) -> Array:
@@ -120,8 +137,21 @@ class Ladder:
             if index in self._summed and self.problem.fit_weights.shape[1] == 1:
                 self._bands[index] = self._summed[index].pairs[0].band
             else:
-                self._bands[index] = banded_gram(self.problem.weighted(self.designs(index)))
+                self._bands[index] = banded_gram(self.designs(index), self.problem.row_weights)
         return self._bands[index]
+
+    def smooth_band(self, index: int) -> Array:
+        """The same, if neighbouring angle sums were seen alike: its diagonal, and the overlaps of splines beside it."""
+        if index in self._bands or index in self._summed:
+            return self.band(index)
+        if index not in self._smooth_bands:
+            grid = self.grids[index]
+            root = np.sqrt(np.sum(exposures(self.designs(index), np.square(self.problem.row_weights[:, 0])), axis=0))
+            band = np.zeros((grid.degree + 1, grid.size))
+            for d, overlap in enumerate(grid.overlaps()):
+                band[d, : grid.size - d] = overlap * root[: grid.size - d] * root[d:]
+            self._smooth_bands[index] = band
+        return self._smooth_bands[index]
 
     def bounded(self, index: int, free: Fit) -> Fit:
         """The maximum within the bounds, from the free one, or from coarser knots where that leads nowhere near it."""
@@ -205,9 +235,11 @@ class Ladder:
 
     def spare(self, index: int) -> float:
         """Share of the data that as many coefficients as the grid has leave over; told before the grid's moments are made."""
-        known = next(iter(self._summed.values()))
-        unknown = self.grids[index].size + known.cross.shape[0] * known.elements
-        return float(1 - unknown / max(1, known.observations))
+        rows, realisations = self.problem.data.shape
+        weights = self.problem.fit_weights
+        observations = np.count_nonzero(weights) * (rows * realisations // weights.size)
+        unknown = self.grids[index].size + realisations * self.problem.card.elements
+        return float(1 - unknown / max(1, observations))
 
     def variance(self, objective: float, freedom: int) -> float:
         """Of the noise in units of the weights: 1 where it is stated, else what a misfit says."""
@@ -221,11 +253,31 @@ class Ladder:
 
     def coarsened(self, index: int, r: Array) -> Array:
         """Coefficients on the next coarser grid that come nearest where the captures look."""
-        halved = self.grids[index - 1].in_halved()
-        weighted = sp.csr_array(halved.multiply(self.summed(index).exposure[:, None]))
-        gram = sp.csc_array(weighted.T @ halved)
-        gram += 1e-9 * float(gram.diagonal().max()) * sp.eye_array(gram.shape[0])
-        return np.asarray(spl.spsolve(gram, weighted.T @ r), dtype=np.float64)
+        return _nearest(self.grids[index - 1].in_halved(), r, self.summed(index).exposure)
+
+    def detail(self, index: int) -> float:
+        """The misfit of knots four times as far apart by the closed form: nearly all error of their splines, not noise."""
+        closed, (coarse, fine) = self.closed(index), self.grids[index - 2 : index]
+        prolongation = sp.csr_array(fine.in_halved() @ coarse.in_halved())
+        r = closed.coefficients
+        lost = r - prolongation @ _nearest(prolongation, r, closed.exposure)
+        films = np.stack([t @ lost for t in self.designs(index)], axis=1) @ closed.source
+        return float(np.sum(self.problem.fit_weights * films**2))
+
+    def foretold(self, index: int, detail: float) -> float:
+        """The misfit of knots twice as far apart, from that of knots four times as far apart: as for a smooth rho.
+
+        The error of its splines falls by 2^(degree + 1) with each halving of the knots.
+        """
+        return detail / 4.0 ** (self.grids[index].degree + 1)
+
+
+def _nearest(prolongation: sp.csr_array, r: Array, exposure: Array) -> Array:
+    """Coefficients r' of which the prolongation R r' comes nearest to r where the captures look."""
+    weighted = sp.csr_array(prolongation.multiply(exposure[:, None]))
+    gram = sp.csc_array(weighted.T @ prolongation)
+    gram += 1e-9 * float(gram.diagonal().max()) * sp.eye_array(gram.shape[0])
+    return np.asarray(spl.spsolve(gram, weighted.T @ r), dtype=np.float64)
 
 
 def _quadrature(problem: Problem, tolerance: float | None) -> float:

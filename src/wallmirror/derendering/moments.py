@@ -9,7 +9,7 @@ so that an iteration of a fit does not touch the pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -54,6 +54,11 @@ class Pairs:
         above = sp.csr_array((values, columns + first, pointers), shape=(entries.size, entries.size))
         return cls(above, elements)
 
+    def coarser(self, halved: sp.csr_array) -> Pairs:
+        """R^T N_ij R for R of shape (K, K')."""
+        every = sp.csr_array(sp.kron(sp.eye_array(self.above.shape[0] // self.size), halved, format="csr"))
+        return Pairs(sp.csr_array(every.T.tocsr() @ (self.above @ every)), self.elements)
+
     @property
     def size(self) -> int:
         """K."""
@@ -77,9 +82,10 @@ class Pairs:
         return np.asarray(np.repeat(row, np.diff(self.above.indptr)) + self.above.indices % size)
 
     @cached_property
-    def _counts(self) -> NDArray[np.int64]:
-        """Entries of each pair."""
-        return np.asarray(np.diff(self.above.indptr[:: self.size]))
+    def _flat(self) -> sp.csc_array:
+        """N_ij as columns of (K^2, M (M + 1) / 2), so that a product sums them up."""
+        pointers, size = self.above.indptr[:: self.size], self.size
+        return sp.csc_array((self.above.data, self._where, pointers), shape=(size * size, pointers.size - 1))
 
     @cached_property
     def band(self) -> Array:
@@ -106,10 +112,8 @@ class Pairs:
 
     def mixed(self, products: Array) -> Array:
         """sum_ij products_ij N_ij for symmetric products (M, M), dense (K, K)."""
-        size = self.size
         factors = (products - 0.5 * np.diag(np.diag(products)))[self._of]
-        weights = self.above.data * np.repeat(factors, self._counts)
-        square = np.bincount(self._where, weights=weights, minlength=size * size).reshape(size, size)
+        square = (self._flat @ factors).reshape(self.size, self.size)
         return np.asarray(square + square.T, dtype=np.float64)
 
 
@@ -160,6 +164,11 @@ class Moments:
     def seen(self) -> NDArray[np.bool_]:
         """Which coefficients the captures see at all, shape (K,)."""
         return np.asarray(self.exposure > LEAST_SEEN)
+
+    def coarser(self, halved: sp.csr_array) -> Moments:
+        """Those on knots twice as far apart, whose r is `halved` r on these knots, (K, K'); see `SplineGrid.in_halved`."""
+        cross = (self.cross.reshape(-1, self.size) @ halved).reshape(*self.cross.shape[:2], -1)
+        return replace(self, pairs=[pairs.coarser(halved) for pairs in self.pairs], cross=cross, apart=None)
 
     def gram_of_source(self, v: Array) -> Array:
         """sum_b J_b^T W J_b, dense (K, K), for v of shape (B, M)."""

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from wallmirror.derendering.bounds import Bound
 from wallmirror.derendering.knots import Level
 from wallmirror.derendering.problem import Problem, too_few_patterns
+from wallmirror.derendering.splines import exposures
 from wallmirror.derendering.subspace import CERTAIN, LIKELY, noise_edge
 
 Array = NDArray[np.float64]
@@ -105,8 +106,7 @@ def standing_out(strength: Array, rows: int, realisations: int, free: int, units
 def free_coefficients(problem: Problem, level: Level, source: Array, sigma: float) -> int:
     """Most coefficients of rho that would be free, were one element dark: those that the others hardly show."""
     weights = np.broadcast_to(np.square(problem.row_weights), (problem.data.shape[0], 1))[:, 0]
-    shown = np.stack([t.multiply(t).T @ weights for t in level.designs])  # (M, K)
-    shown = shown * np.sum(source * source, axis=1)[:, None]
+    shown = exposures(level.designs, weights) * np.sum(source * source, axis=1)[:, None]
     by_others = (np.sum(shown, axis=0) - shown)[:, level.summed.seen]
     largest = float(np.max(np.abs(level.free.coefficients)))
     return int(np.max(np.count_nonzero(by_others < (sigma / (_FREE * largest)) ** 2, axis=1)))

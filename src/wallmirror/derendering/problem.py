@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.facets import Factor, weighted
+from wallmirror.derendering.span import Span
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
-from wallmirror.derendering.subspace import ClosedForm, SignalSpace, noise_edge, signal_space, space_within
+from wallmirror.derendering.subspace import ClosedForm, SignalSpace, noise_edge, signal_space
 from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card
 from wallmirror.memory import require_memory, solution_bytes
@@ -31,8 +32,8 @@ _SILENT, _DROWNED = 1e-32, 1e60
 # Standard deviations above which a radiance stands out of its noise; those that, over the brightest such, say as much as
 # infinite ones.
 _CLEAR, _DEAF = 5.0, 1e6
-# Knot spacings in degrees of the BRDFs into whose span noisy captures are projected, the most faithful first.
-_PROJECTION_STEPS = (1.0, 2.0, 4.0)
+# Knot spacings in degrees of the BRDFs into whose span noisy captures are projected, each half of the one before.
+_PROJECTION_STEPS = (4.0, 2.0, 1.0)
 # Noise below this share of the films is none that a projection could be sure of taking away.
 _ROUNDING = 1e-6
 
@@ -273,14 +274,20 @@ def _signal_space(problem: Problem, *, weak_patterns: bool) -> SignalSpace:
     if space.rank == elements:
         return space
     certain = floor < _ROUNDING * space.singular_values[0]
-    for step in () if certain else _PROJECTION_STEPS:
+    if not certain:
+        kernel = problem.kernel(_PROJECTION_STEPS[-1], 1e-4)
+        grids = [grid_for(kernel, step=math.radians(_PROJECTION_STEPS[0]), degree=3)]
+        for _ in _PROJECTION_STEPS[1:]:
+            grids.append(grids[-1].halved())
+        span = Span.of(problem.weighted_data, problem.weighted(design_matrices(kernel, grids[-1])))
         # Where patterns drown in the films, the finest BRDF grid in whose span they stand out is taken.
-        _, designs = problem.designs(step, degree=3, tolerance=1e-4)
-        noise = 1.0 if problem.noise_is_stated else None
-        within = space_within(problem.weighted_data, problem.weighted(designs), elements, noise=noise)
-        if within.rank == elements:
-            return within
-        space = within if within.rank > space.rank else space
+        for grid in reversed(grids):
+            if grid is not grids[-1]:
+                span = span.coarser(grid.in_halved())
+            within = span.space(elements, noise=1.0 if problem.noise_is_stated else None)
+            if within.rank == elements:
+                return within
+            space = within if within.rank > space.rank else space
     if certain or not weak_patterns:
         raise too_few_patterns(space.rank, elements)
     return space

@@ -99,6 +99,15 @@ class SplineGrid:
         coarse = np.broadcast_to(k, finer.shape)
         return sp.csr_array((weights[inside], (finer[inside], coarse[inside])), shape=(size, self.size))
 
+    def overlaps(self) -> Array:
+        """Inner products of a spline with those 0, 1, .., degree knots beside it, over its own square, shape (degree + 1,).
+
+        They are the values of the spline of degree 2 degree + 1 at its knots.
+        """
+        order = 2 * self.degree + 1
+        at_knots = SplineGrid(start=0.0, step=1.0, intervals=1, degree=order).basis(0.0)[1]
+        return np.asarray(at_knots[self.degree : order] / at_knots[self.degree])
+
     def row(self, u: float) -> Array:
         """Values of all K basis functions at one angle sum, shape (K,)."""
         first, values = self.basis(np.array([u]))
@@ -181,6 +190,12 @@ def design_matrices(kernel: Kernel, grid: SplineGrid) -> list[sp.csr_array]:
         values *= weight[:, :, i].reshape(rows, nodes)
         matrices.append(_banded_rows(first, values, grid.size))
     return matrices
+
+
+def exposures(designs: list[sp.csr_array], weights: Array) -> Array:
+    """sum_p w_p T_i[p, k]^2 of each element and coefficient, shape (M, K), for w of shape (P,)."""
+    squares = (sp.csr_array((t.data * t.data, t.indices, t.indptr), t.shape) for t in designs)
+    return np.stack([t.T @ weights for t in squares])
 
 
 def _banded_rows(columns: NDArray[np.intp], weighted: Array, size: int) -> sp.csr_array:

@@ -18,9 +18,6 @@ import scipy.linalg as sl
 import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
-from scipy.linalg import lapack
-
-from wallmirror.memory import require_memory, span_bytes
 
 Array = NDArray[np.float64]
 
@@ -132,42 +129,13 @@ def noise_edge(rows: int, columns: int, units: float = CERTAIN) -> float:
     return math.sqrt(edge**2 + units * scale)
 
 
-def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noise: float | None) -> SignalSpace:
-    """U from the data's projection onto what any BRDF on the designs' grid could make of any pattern.
-
-    All of F V lies in the span of T_1 .. T_M, whose dimension is at most M K; noise fills all P dimensions. The
-    projection leaves the signal and takes all but M K / P of the noise's power away, so that patterns stand out which
-    drown in the films as they are.
-
-    Parameters
-    ----------
-    data, designs:
-        D (P, B) and T_1 .. T_M (P, K), rows weighted so that the noise of all is alike.
-    noise:
-        Its standard deviation; None to estimate it from what the projection takes away.
-    """
-    span = sp.csc_array(sp.hstack(designs))
-    require_memory(span_bytes(span.shape[1]), f"the span of {len(designs)} elements on {designs[0].shape[1]} knots")
-    # Pivoted Cholesky of the Gram matrix: the columns that span, best first, and the triangle that makes them orthonormal.
-    factor, pivots, dimensions, _ = lapack.dpstrf((span.T @ span).toarray(), lower=True, tol=-1.0)
-    strength = np.diag(factor)[:dimensions]
-    dimensions = int(np.count_nonzero(strength * strength > 1e-10 * strength[0] * strength[0]))
-    span, triangle = span[:, pivots[:dimensions] - 1], factor[:dimensions, :dimensions]
-    projected = sl.solve_triangular(triangle, span.T @ data, lower=True, check_finite=False)
-    left, singular, _ = np.linalg.svd(projected, full_matrices=False)
-    if noise is None:
-        rest = max(0.0, float(np.sum(data * data) - np.sum(projected * projected)))
-        noise = math.sqrt(rest / max(1, (data.shape[0] - dimensions) * data.shape[1]))
-    floor = noise * noise_edge(dimensions, data.shape[1])
-    # The span's weakest directions are known to the root of what was kept of them, no better.
-    rounding = 1e-7 * singular[0]
-    rank = int(np.count_nonzero(singular[:elements] > max(rounding, floor)))
-    within = sl.solve_triangular(triangle, left[:, :elements], lower=True, trans="T", check_finite=False)
-    return SignalSpace(span @ within, singular, rank, dimensions)
-
-
 def closed_form(
-    data: Array, designs: list[sp.csr_array], space: SignalSpace, *, band: Array | None = None
+    data: Array,
+    designs: list[sp.csr_array],
+    space: SignalSpace,
+    *,
+    row_weights: Array | None = None,
+    band: Array | None = None,
 ) -> ClosedForm:
     """Recover r, F and V from data whose rank is M: minimise sum_i |(I - U U^T) T_i r|^2.
 
@@ -179,8 +147,10 @@ def closed_form(
         T_1 .. T_M, each (P, K).
     space:
         `signal_space(data, M)` with rank M.
+    row_weights:
+        Of shape (P, 1), where the data's rows are weighted and the designs' are not yet.
     band:
-        `banded_gram(designs)` where it is known already.
+        `banded_gram(designs, row_weights)` where it is known already.
 
     Notes
     -----
@@ -189,15 +159,17 @@ def closed_form(
     """
     u = space.basis
     size = designs[0].shape[1]
-    stacked = np.concatenate([(t.T @ u).T for t in designs])  # H, (M^2, K); rows i*M..i*M+M-1 belong to T_i
-    band = banded_gram(designs) if band is None else band
+    weights = np.ones((u.shape[0], 1)) if row_weights is None else row_weights
+    weighted = weights * u
+    stacked = np.concatenate([(t.T @ weighted).T for t in designs])  # H, (M^2, K); rows i*M..i*M+M-1 belong to T_i
+    band = banded_gram(designs, row_weights) if band is None else band
     factor = _banded_cholesky(band)
     values, vectors = _leading_pairs(stacked, factor, len(designs))
     r = sl.cho_solve_banded((factor, True), stacked.T @ vectors[:, 0])
     projected = (stacked @ r).reshape(len(designs), -1).T  # W, (M, M): column i is U^T T_i r
     norm, missed = 0.0, 0.0
     for i, t in enumerate(designs):
-        column = t @ r
+        column = weights[:, 0] * (t @ r)
         # The residual itself: 1 - lambda_1 from the eigenvalue would end at 1e-16, this goes on to its square.
         missed += float(np.sum((column - u @ projected[:, i]) ** 2))
         norm += float(column @ column)
@@ -224,8 +196,8 @@ def closed_form(
     )
 
 
-def banded_gram(designs: list[sp.csr_array]) -> Array:
-    """Lower band of A = sum_i T_i^T T_i, shape (w, K): entry [d, k] is A[k + d, k].
+def banded_gram(designs: list[sp.csr_array], row_weights: Array | None = None) -> Array:
+    """Lower band of A = sum_i T_i^T T_i, shape (w, K), of rows weighted first if need be: entry [d, k] is A[k + d, k].
 
     Rows that are runs of neighbouring columns, of equal length within each T_i, as `design_matrices` makes them, sum up
     without a sparse product.
@@ -233,10 +205,14 @@ def banded_gram(designs: list[sp.csr_array]) -> Array:
     size = designs[0].shape[1]
     widths = [run_length(t) for t in designs]
     if 0 in widths:
+        if row_weights is not None:
+            designs = [sp.csr_array(t.multiply(row_weights)) for t in designs]
         return _band_of(sp.csr_array(sum(t.T @ t for t in designs)))
+    by_row = 1.0 if row_weights is None else row_weights[:, 0]
     band = np.zeros((max(widths), size))
     for t, width in zip(designs, widths, strict=True):
-        columns, first = np.ascontiguousarray(t.data.reshape(-1, width).T), t.indices[::width].astype(np.intp)
+        columns = by_row * np.ascontiguousarray(t.data.reshape(-1, width).T)
+        first = t.indices[::width].astype(np.intp)
         for d in range(width):
             for k in range(width - d):
                 sums = np.bincount(first, weights=columns[k] * columns[k + d], minlength=size)

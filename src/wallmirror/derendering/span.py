@@ -1,0 +1,159 @@
+"""What any BRDF on some knots could make of any pattern: the span of T_1 .. T_M, and the films' projection onto it.
+
+All of F V lies in that span, whose dimension is at most M K; noise fills all P dimensions. The projection leaves the signal
+and takes all but M K / P of the noise's power away, so that patterns stand out which drown in the films as they are.
+
+A pixel looks at few columns, and pixels beside each other at nearly the same ones. So the Gram matrix is a band once its
+columns are in a good order, and a Cholesky factorisation that pivots within a few hundred columns at a time never looks
+beyond the band.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as sl
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from wallmirror.derendering.subspace import SignalSpace, noise_edge
+from wallmirror.memory import require_memory, span_bytes
+
+Array = NDArray[np.float64]
+
+# Columns among which the factorisation pivots.
+_TOGETHER = 256
+# A column of which less than this share of the largest one's square is left beside those before it spans nothing new.
+_NEW = 1e-10
+# The span's weakest directions are known to the root of that, no better.
+_ROUNDING = 1e-7
+
+
+@dataclass(frozen=True)
+class Span:
+    """The columns S = [T_1 .. T_M] and what the projection needs of them and of the films.
+
+    Parameters
+    ----------
+    columns:
+        S of the finest knots, sparse (P, n).
+    prolongation:
+        R, sparse (n, n'), where coarser knots have taken their place: theirs are S R.
+    gram, right:
+        (S R)^T S R, sparse (n', n'), and (S R)^T D, shape (n', B).
+    energy:
+        sum D^2.
+    elements:
+        M.
+    """
+
+    columns: sp.csc_array
+    prolongation: sp.csr_array
+    gram: sp.csr_array
+    right: Array
+    energy: float
+    elements: int
+
+    @classmethod
+    def of(cls, data: Array, designs: list[sp.csr_array]) -> Span:
+        """From D (P, B) and T_1 .. T_M (P, K), rows weighted so that the noise of all is alike; InputError where too large."""
+        columns = sp.csc_array(sp.hstack(designs))
+        size = columns.shape[1]
+        require_memory(span_bytes(size), f"the span of {len(designs)} elements on {designs[0].shape[1]} knots")
+        gram = sp.csr_array(columns.T @ columns)
+        itself = sp.eye_array(size, format="csr")
+        return cls(columns, itself, gram, columns.T @ data, float(np.sum(data * data)), len(designs))
+
+    def coarser(self, halved: sp.csr_array) -> Span:
+        """That of knots twice as far apart, whose r is `halved` r on these knots, (K, K'); see `SplineGrid.in_halved`."""
+        every = sp.block_diag([halved] * self.elements, format="csr")
+        gram = sp.csr_array(every.T @ self.gram @ every)
+        return Span(self.columns, self.prolongation @ every, gram, every.T @ self.right, self.energy, self.elements)
+
+    def space(self, elements: int, *, noise: float | None) -> SignalSpace:
+        """U of the projection.
+
+        Parameters
+        ----------
+        elements:
+            Patterns that are sought.
+        noise:
+            Standard deviation of the noise; None to estimate it from what the projection takes away.
+        """
+        basis = _Basis.of(self.gram)
+        projected = basis.projected(self.right)
+        left, singular, _ = np.linalg.svd(projected, full_matrices=False)
+        rows, dimensions = self.columns.shape[0], projected.shape[0]
+        if noise is None:
+            rest = max(0.0, self.energy - float(np.sum(projected * projected)))
+            noise = math.sqrt(rest / max(1, (rows - dimensions) * self.right.shape[1]))
+        floor = noise * noise_edge(dimensions, self.right.shape[1])
+        rank = int(np.count_nonzero(singular[:elements] > max(_ROUNDING * singular[0], floor)))
+        within = self.columns @ (self.prolongation @ basis.combined(left[:, :elements]))
+        return SignalSpace(within, singular, rank, dimensions)
+
+
+def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noise: float | None) -> SignalSpace:
+    """U from the data's projection onto what any BRDF on the designs' grid could make of any pattern; see `Span`."""
+    return Span.of(data, designs).space(elements, noise=noise)
+
+
+@dataclass(frozen=True)
+class _Basis:
+    """An orthonormal basis Q = S C of the span: C^-T is a lower triangle, kept piece by piece.
+
+    Parameters
+    ----------
+    order:
+        Of the columns of S.
+    pieces:
+        Of each few hundred columns in that order: the kept ones' places, their triangle L, and L^-1 times the part of the
+        Gram matrix that is left between them and the columns ahead, from `stop` on.
+    """
+
+    order: NDArray[np.intp]
+    pieces: list[tuple[NDArray[np.intp], Array, Array, int]]
+
+    @classmethod
+    def of(cls, gram: sp.csr_array) -> _Basis:
+        order = np.asarray(reverse_cuthill_mckee(gram, symmetric_mode=True), dtype=np.intp)
+        size, place = order.size, np.argsort(order)
+        row, column = (place[at] for at in gram.tocoo().coords)
+        left = np.zeros((size, size))
+        left[row, column] = gram.data
+        reach = int(np.max(row - column, initial=0))
+        least = _NEW * float(np.max(np.diag(left), initial=0.0))
+        pieces = []
+        for start in range(0, size, _TOGETHER):
+            stop = min(start + _TOGETHER, size)
+            ahead = slice(stop, stop + reach)
+            factor, pivots, rank, _ = lapack.dpstrf(left[start:stop, start:stop], lower=True, tol=least)
+            kept, triangle = start + pivots[:rank] - 1, factor[:rank, :rank]
+            further = sl.solve_triangular(triangle, left[kept, ahead], lower=True, check_finite=False)
+            left[ahead, ahead] -= further.T @ further
+            pieces.append((kept, triangle, further, stop))
+        return cls(order, pieces)
+
+    def projected(self, right: Array) -> Array:
+        """Q^T D from S^T D (n, B)."""
+        right, found = right[self.order], []
+        for kept, triangle, further, stop in self.pieces:
+            found.append(sl.solve_triangular(triangle, right[kept], lower=True, check_finite=False))
+            right[stop : stop + further.shape[1]] -= further.T @ found[-1]
+        return np.concatenate(found)
+
+    def combined(self, coordinates: Array) -> Array:
+        """C x, shape (n, m): how S makes Q x of coordinates x (dimensions, m)."""
+        found = np.zeros((self.order.size, coordinates.shape[1]))
+        end = coordinates.shape[0]
+        for kept, triangle, further, stop in reversed(self.pieces):
+            missing = coordinates[end - kept.size : end] - further @ found[stop : stop + further.shape[1]]
+            found[kept] = sl.solve_triangular(triangle, missing, lower=True, trans="T", check_finite=False)
+            end -= kept.size
+        combined = np.empty_like(found)
+        combined[self.order] = found
+        return combined
