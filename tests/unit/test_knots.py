@@ -17,6 +17,7 @@ from scipy.interpolate import BSpline
 
 from wallmirror.brdf import GaussianTrain
 from wallmirror.captures import CaptureSet
+from wallmirror.derendering.climbing import climb
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.finer import Films, Finer, loss, score, worth
 from wallmirror.derendering.information import information
@@ -240,6 +241,31 @@ def test_the_closed_forms_detail_foretells_what_coarser_knots_lose() -> None:
     assert 0.5 < foretold[60] / (coarse.objective - best.objective) < 4
     # In units of the noise: 20 dB are a factor of 100, less what noise adds to the closed form's detail.
     assert foretold[60] / foretold[40] == pytest.approx(100, rel=0.3)
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_fit_on_coarser_knots_that_comes_to_another_maximum_is_tried_again(seed: int) -> None:
+    # Elements beside each other, seen by few pixels: r of fine knots, brought to coarse ones, is no start for a fit.
+    angles = tuple(0.15 - 0.06 * k for k in range(6))
+    observer = Observer(position=(0.144, -5.0), fov=1.166, view_angles=angles, pixels=64, pixels_at="centres")
+    card = Card(elements_x=(-0.733, -0.174, 0.047, 0.076), y=-5.14)
+    brdf = GaussianTrain(centres=(0.627,), sigma=0.0353)
+    rng = np.random.default_rng(seed)
+    films = radiance(transport_matrix(observer, card, brdf, weights="cosine"), rng.random((4, 5)))
+    sigma = 0.01 * float(np.sqrt(np.mean(films**2)))
+    films = films + sigma * rng.standard_normal(films.shape)
+    variance = np.full(films.shape, sigma**2)
+    captures = CaptureSet(observer=observer, card=card, transport="cosine", radiance=films, variance=variance)
+    ladder = Ladder.of(*prepare(captures), NOISY_STEPS, None)
+    coarse, fine = NOISY_STEPS.index(1.0), NOISY_STEPS.index(0.5)
+    best = maximise(ladder.summed(fine), ladder.closed(fine).coefficients, nonnegative=False)
+    astray = maximise(ladder.summed(coarse), ladder.coarsened(fine, best.coefficients), nonnegative=False)
+    sound = maximise(ladder.summed(coarse), ladder.closed(coarse).coefficients, nonnegative=False)
+    assert astray.objective > 100 * sound.objective  # or there is nothing to try again
+    fits, _ = climb(ladder, fine, False, None, lambda _: None)
+    # The knots that noise alone calls for, with the fit on them as good as a climb ends between knots.
+    assert list(fits) == [coarse]
+    assert fits[coarse].objective == pytest.approx(sound.objective, rel=1e-4)
 
 
 def test_what_stands_for_a_band_leads_the_search_as_well() -> None:

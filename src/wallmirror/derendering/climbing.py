@@ -25,8 +25,10 @@ Tell = Callable[[str], None]
 
 # Share of a tolerance below which a move of the pattern is none.
 _SETTLED = 0.25
-# So many times more than noise explains must coarser knots lose by a quadratic guess for no fit to be tried on them.
-_HOPELESS = 2.0
+# So many times more than noise explains must coarser knots lose by a quadratic guess for no fit to be tried on them: of a
+# change of the films that is no small share of their power, and of a smaller one, for which the guess is good.
+_HOPELESS, _POOR = 20.0, 2.0
+_SMALL = 1e-4
 # Share of the BRDF's largest coefficient above which one is lit, of the best-seen one's information above which that one
 # counts, and of lit coefficients up to which rho is sparse.
 _LIT = 0.01
@@ -60,6 +62,10 @@ def climb(
     while index > 0 and not _needed(ladder, index, best, tell):  # coarser ones may do
         finer_fits[index] = best
         coarser = fit(index - 1, ladder.coarsened(index, best.coefficients))
+        if coarser.objective - best.objective > _HOPELESS * ladder.price(index - 1, index, best):
+            # So much was not foretold: what is nearest where the captures look led to another maximum.
+            again = fit(index - 1, ladder.closed(index - 1).coefficients)
+            coarser = min(coarser, again, key=lambda each: each.objective)
         # Against each of the finer ones: steps of which none loses much may lose much together.
         losses = ((finer, each, coarser.objective - each.objective) for finer, each in finer_fits.items())
         if any(loss >= ladder.price(index - 1, finer, each) for finer, each, loss in losses):
@@ -108,7 +114,8 @@ def _needed(ladder: Ladder, index: int, fit: Fit, tell: Tell) -> bool:
     lost = loss(schur, fit.coefficients[summed.seen], pull, halved)
     freedom = ladder.freedom(index)
     saved = max(1, halved.shape[0] - int(np.count_nonzero(halved.sum(axis=0))))
-    if lost < _HOPELESS * worth(saved, freedom) * ladder.variance(fit.objective, freedom):
+    many = _POOR if lost < _SMALL * float(np.sum(summed.energy)) else _HOPELESS
+    if lost < many * worth(saved, freedom) * ladder.variance(fit.objective, freedom):
         return False
     tell(f"knots every {math.degrees(ladder.grids[index - 1].step):g} deg would raise it by about {lost:.4g}")
     return True
