@@ -5,7 +5,8 @@ and takes all but M K / P of the noise's power away, so that patterns stand out 
 
 A pixel looks at few columns, and pixels beside each other at nearly the same ones. So the Gram matrix is a band once its
 columns are in a good order, and a Cholesky factorisation that pivots within a few hundred columns at a time never looks
-beyond the band.
+beyond the band. It must pivot within as many as the band is wide: where it sees a few angles of very many elements only,
+the columns that it keeps say those further ahead by extrapolation, which multiplies rounding from piece to piece.
 """
 
 from __future__ import annotations
@@ -25,8 +26,10 @@ from wallmirror.memory import require_memory, span_bytes
 
 Array = NDArray[np.float64]
 
-# Columns among which the factorisation pivots.
+# Columns among which the factorisation pivots, at least.
 _TOGETHER = 256
+# Columns of which the others that they meet are counted beforehand.
+_SAMPLED = 256
 # A column of which less than this share of the largest one's square is left beside those before it spans nothing new.
 _NEW = 1e-10
 # The span's weakest directions are known to the root of that, no better.
@@ -63,7 +66,10 @@ class Span:
         """From D (P, B) and T_1 .. T_M (P, K), rows weighted so that the noise of all is alike; InputError where too large."""
         columns = sp.csc_array(sp.hstack(designs))
         size = columns.shape[1]
-        require_memory(span_bytes(size), f"the span of {len(designs)} elements on {designs[0].shape[1]} knots")
+        # A sample of columns tells to some per cent how many entries the Gram matrix will have.
+        sample = np.random.default_rng(0).choice(size, min(size, _SAMPLED), replace=False)
+        entries = 1.25 * size / sample.size * (columns.T @ columns[:, sample]).nnz
+        require_memory(span_bytes(entries), f"the span of {len(designs)} elements on {designs[0].shape[1]} knots")
         gram = sp.csr_array(columns.T @ columns)
         itself = sp.eye_array(size, format="csr")
         return cls(columns, itself, gram, columns.T @ data, float(np.sum(data * data)), len(designs))
@@ -119,23 +125,26 @@ class _Basis:
     pieces: list[tuple[NDArray[np.intp], Array, Array, int]]
 
     @classmethod
-    def of(cls, gram: sp.csr_array) -> _Basis:
+    def of(cls, gram: sp.csr_array, together: int | None = None) -> _Basis:
         order = np.asarray(reverse_cuthill_mckee(gram, symmetric_mode=True), dtype=np.intp)
-        size, place = order.size, np.argsort(order)
-        row, column = (place[at] for at in gram.tocoo().coords)
-        left = np.zeros((size, size))
-        left[row, column] = gram.data
-        reach = int(np.max(row - column, initial=0))
-        least = _NEW * float(np.max(np.diag(left), initial=0.0))
+        ordered = sp.csr_array(gram[order][:, order])
+        row, column = ordered.tocoo().coords
+        size, reach = order.size, int(np.max(row - column, initial=0))
+        together = max(_TOGETHER, reach) if together is None else together
+        require_memory(span_bytes(ordered.nnz, size, reach), f"the span of {size} columns in a band of {reach}")
+        least = _NEW * float(np.max(ordered.diagonal(), initial=0.0))
         pieces = []
-        for start in range(0, size, _TOGETHER):
-            stop = min(start + _TOGETHER, size)
-            ahead = slice(stop, stop + reach)
-            factor, pivots, rank, _ = lapack.dpstrf(left[start:stop, start:stop], lower=True, tol=least)
-            kept, triangle = start + pivots[:rank] - 1, factor[:rank, :rank]
-            further = sl.solve_triangular(triangle, left[kept, ahead], lower=True, check_finite=False)
-            left[ahead, ahead] -= further.T @ further
-            pieces.append((kept, triangle, further, stop))
+        left = np.zeros((0, 0))  # what is left of the Gram matrix between the columns from `start` on, up to the reach
+        for start in range(0, size, together):
+            stop, end = min(start + together, size), min(start + together + reach, size)
+            before, left = left, ordered[start:end, start:end].toarray()
+            left[: len(before), : len(before)] = before
+            here = stop - start
+            factor, pivots, rank, _ = lapack.dpstrf(left[:here, :here], lower=True, tol=least)
+            kept, triangle = pivots[:rank] - 1, factor[:rank, :rank]
+            further = sl.solve_triangular(triangle, left[kept, here:], lower=True, check_finite=False)
+            left = left[here:, here:] - further.T @ further
+            pieces.append((start + kept, triangle, further, stop))
         return cls(order, pieces)
 
     def projected(self, right: Array) -> Array:
