@@ -208,8 +208,8 @@ def _judged(
     best = candidates[0].point
     steepest, flat = _slopes(system, best, help_from)
     residual = math.sqrt(best.objective)
-    noise = residual / math.sqrt(max(1, system.freedom))
-    apart = min(max(SAME, 3 * noise / flat), APART)
+    bars, least = _bars(system, best)
+    apart = min(max(SAME, BARS * bars), APART)
     for other in candidates[1:]:
         if scale_free_error(other.point.v, best.v) > apart and _as_good(other.point, best, system):
             raise UndeterminedError(
@@ -234,7 +234,7 @@ def _judged(
         agreeing=candidates[0].reached,
         exposure=exposure,
         others=tuple(_unscaled(problem, system, c.point) for c in in_question(candidates)[1:]),
-        rise=_rise(system, best, nonnegative=nonnegative),
+        rise=_rise(system, best, BARS * bars, least, nonnegative=nonnegative),
     )
 
 
@@ -247,17 +247,23 @@ def _unscaled(problem: Problem, system: System, point: Point) -> tuple[Array, Ar
     return sign * r, sign * source
 
 
-def _rise(system: System, point: Point, *, nonnegative: bool) -> float:
-    """What the misfit rises by at `BARS` error bars, in variances of the noise: bars hold only as far as it is a parabola."""
+def _bars(system: System, point: Point) -> tuple[float, Array]:
+    """The relative error of V that noise as large as the misfit makes, and the direction that is seen least, (M, B)."""
     normal, _ = normal_of_pattern(system, point, np.ones_like(point.v, dtype=bool))
     values, vectors = np.linalg.eigh(normal)
     variance = point.objective / max(1, system.freedom)
-    off = BARS * math.sqrt(variance * float(np.sum(1 / np.maximum(values[1:], 1e-300))))
+    bars = math.sqrt(variance * float(np.sum(1 / np.maximum(values[1:], 1e-300))))
+    return bars, vectors[:, min(1, values.size - 1)].reshape(point.v.shape, order="F")
+
+
+def _rise(system: System, point: Point, off: float, least: Array, *, nonnegative: bool) -> float:
+    """What the misfit rises by where V is that far off, in variances of the noise: bars hold only where it is a parabola."""
+    variance = point.objective / max(1, system.freedom)
     if off >= 1 or variance == 0:
         return math.inf  # no pattern is as far off as that
-    least = vectors[:, 1].reshape(point.v.shape, order="F") * off / math.sqrt(1 - off * off)
+    step = least * off / math.sqrt(1 - off * off)
     rises = [math.inf]
-    for v in (point.v + least, point.v - least):
+    for v in (point.v + step, point.v - step):
         there = np.maximum(v, 0.0) if nonnegative else v
         # Where V >= 0 stops the way before its end, the bars are too wide, which does no harm.
         if scale_free_error(there, point.v) > (1 - _CUT) * off:
