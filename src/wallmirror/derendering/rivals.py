@@ -83,6 +83,7 @@ def hold_against_rivals(
     rivals: Sequence[Estimate],
     refit: Refit,
     check: Check,
+    search: Callable[[Problem], Estimate],
     *,
     wall: WallModel,
     excused: float = 0.0,
@@ -98,6 +99,8 @@ def hold_against_rivals(
         As `facet_fit.settle_wall` gives it.
     rivals:
         The other patterns, each the search's estimate with that one's r and V.
+    search:
+        The search for a problem with any exponents: a wall of facets that was fitted next to a pattern is searched once more.
     wall:
         What the wall may be: facets are an answer unless it is "angle_sum", and a reason to doubt even then.
     excused:
@@ -109,11 +112,36 @@ def hold_against_rivals(
     UndeterminedError
         When a rival explains the films as well as the answer, on a wall of the same kind.
     """
-    best = _fitted(*answer)
+    best = _best(plain, _fitted(*answer), rivals, refit, check, wall, excused, tell)
+    if not best.facets:
+        return best.problem, best.estimate, best.check
+    tell("the search once more, on the wall of facets that was fitted")
+    again = search(best.problem)
+    differ = scale_free_error(again.source, best.estimate.source)
+    if differ > max(SAME, BARS * best.estimate.predicted_error):
+        raise UndeterminedError(
+            f"a wall of facets was fitted next to a pattern that differs by {100 * differ:.2g} % from the one that suits "
+            "such a wall best; capture more different patterns, more views or more light"
+        )
+    doubts = tuple(dict.fromkeys((*best.estimate.warnings, *again.warnings)))
+    return best.problem, replace(best.estimate, warnings=doubts), best.check
+
+
+def _best(
+    plain: Problem,
+    best: _Fitted,
+    rivals: Sequence[Estimate],
+    refit: Refit,
+    check: Check,
+    wall: WallModel,
+    excused: float,
+    tell: Callable[[str], None],
+) -> _Fitted:
+    """The answer, or the rival that is better; refused or with a warning where another one is as good."""
     apart = max(SAME, BARS * best.estimate.predicted_error)
     others = [r for r in rivals if scale_free_error(r.source, best.estimate.source) > apart]
     if not others:
-        return answer
+        return best
     tell(f"{len(others)} other patterns that the search ended at, each at the likelihood's maximum")
     found = _fits(plain, others, refit, check, wall)
     if any(_as_good(f, best) for f in found) and not best.facets and wall == "auto":
@@ -127,7 +155,7 @@ def hold_against_rivals(
     near = [f for f in found if _distance(f, best) > max(SAME, BARS * best.estimate.predicted_error)]
     near = sorted((f for f in near if _as_good(f, best)), key=lambda f: f.misfit)
     if not near:
-        return best.problem, best.estimate, best.check
+        return best
     alike = [f for f in near if f.facets == best.facets or wall == "microfacet"]
     if best.facets or alike:
         raise UndeterminedError(
@@ -139,7 +167,7 @@ def hold_against_rivals(
         "captures as well or better, of which the error bars do not know; capture more different patterns, more views or "
         "more light"
     )
-    return best.problem, replace(best.estimate, warnings=(*best.estimate.warnings, doubt)), best.check
+    return replace(best, estimate=replace(best.estimate, warnings=(*best.estimate.warnings, doubt)))
 
 
 def _fits(

@@ -191,9 +191,10 @@ def solve(
         if few:
             tell(f"{captures.realisations} captures for {captures.card.elements} elements: search for few captures")
             support = None if support_deg is None else math.radians(support_deg)
-            estimate, rivals = solve_scarce(
-                problem, nonnegative=nonnegative, support=support, step_deg=step_deg, seed=seed, tell=tell
+            search = partial(
+                solve_scarce, nonnegative=nonnegative, support=support, step_deg=step_deg, seed=seed, tell=tell
             )
+            estimate, rivals = search(problem)
             refit_next_to = partial(refit_scarce, nonnegative=nonnegative, support=support)
             refit = partial(refit_next_to, before=estimate)
         elif method == "closed_form" or (method == "auto" and _may_be_exact(problem, space)):
@@ -236,6 +237,7 @@ def solve(
                     rivals,
                     refit_next_to,
                     check_angle_sum,
+                    lambda problem: search(problem)[0],
                     wall=model,
                     excused=foretold(plain, estimate) if rivals else 0.0,
                     tell=tell,
