@@ -105,7 +105,7 @@ def test_facets_fitted_next_to_a_pattern_that_does_not_suit_them_best_are_refuse
 
 def test_bars_that_the_misfit_does_not_bear_out_are_doubted(monkeypatch: pytest.MonkeyPatch) -> None:
     captures = films(6, 55)
-    flat = 10.0  # a rise that chance makes more often than once in a thousand times: 3.2 standard deviations
+    flat = 0.4  # of the parabola's rise: bars as wide again by more than a root of two would do
 
     def found(*args: Any, **options: Any) -> FewCaptures:
         return replace(few_captures(*args, **options), rise=flat)

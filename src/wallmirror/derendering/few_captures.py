@@ -52,8 +52,6 @@ _DECISIVE_SHARE = 5e-3
 _SYSTEMATIC = 1e-6
 # Ends that a finer grid is tried on.
 _REFINED = 6
-# Share of the way to where the misfit's rise is looked at that V >= 0 may take away.
-_CUT = 0.3
 _UNDETERMINED = 0.5
 
 
@@ -80,8 +78,8 @@ class FewCaptures:
     others:
         r and V of the other patterns that starts ended at and that explain the films not much worse, the best first.
     rise:
-        Least rise of the misfit, in variances of the noise, where the pattern is off by five error bars along what is seen
-        least: 25 or more where these hold; inf where no pattern lies there.
+        Rise of the misfit where the pattern is off by five error bars along what is seen least, over that of the parabola
+        which the bars stand for, the less of both ways: 1 where they hold; inf where no pattern lies there.
     """
 
     grid: SplineGrid
@@ -208,7 +206,7 @@ def _judged(
     best = candidates[0].point
     steepest, flat = _slopes(system, best, help_from)
     residual = math.sqrt(best.objective)
-    bars, least = _bars(system, best)
+    bars, normal, least = _bars(system, best)
     apart = min(max(SAME, BARS * bars), APART)
     for other in candidates[1:]:
         if scale_free_error(other.point.v, best.v) > apart and _as_good(other.point, best, system):
@@ -234,7 +232,7 @@ def _judged(
         agreeing=candidates[0].reached,
         exposure=exposure,
         others=tuple(_unscaled(problem, system, c.point) for c in in_question(candidates)[1:]),
-        rise=_rise(system, best, BARS * bars, least, nonnegative=nonnegative),
+        rise=_rise(system, best, normal, least, BARS * bars, nonnegative=nonnegative),
     )
 
 
@@ -247,28 +245,28 @@ def _unscaled(problem: Problem, system: System, point: Point) -> tuple[Array, Ar
     return sign * r, sign * source
 
 
-def _bars(system: System, point: Point) -> tuple[float, Array]:
-    """The relative error of V that noise as large as the misfit makes, and the direction that is seen least, (M, B)."""
+def _bars(system: System, point: Point) -> tuple[float, Array, Array]:
+    """The relative error of V that noise as large as the misfit makes, S, and the direction that is seen least, (M, B)."""
     normal, _ = normal_of_pattern(system, point, np.ones_like(point.v, dtype=bool))
     values, vectors = np.linalg.eigh(normal)
     variance = point.objective / max(1, system.freedom)
     bars = math.sqrt(variance * float(np.sum(1 / np.maximum(values[1:], 1e-300))))
-    return bars, vectors[:, min(1, values.size - 1)].reshape(point.v.shape, order="F")
+    return bars, normal, vectors[:, min(1, values.size - 1)].reshape(point.v.shape, order="F")
 
 
-def _rise(system: System, point: Point, off: float, least: Array, *, nonnegative: bool) -> float:
-    """What the misfit rises by where V is that far off, in variances of the noise: bars hold only where it is a parabola."""
-    variance = point.objective / max(1, system.freedom)
-    if off >= 1 or variance == 0:
+def _rise(system: System, point: Point, normal: Array, least: Array, off: float, *, nonnegative: bool) -> float:
+    """What the misfit rises by where V is that far off, over what the parabola with the curvature S does."""
+    if off >= 1 or point.objective == 0:
         return math.inf  # no pattern is as far off as that
     step = least * off / math.sqrt(1 - off * off)
     rises = [math.inf]
-    for v in (point.v + step, point.v - step):
-        there = np.maximum(v, 0.0) if nonnegative else v
-        # Where V >= 0 stops the way before its end, the bars are too wide, which does no harm.
-        if scale_free_error(there, point.v) > (1 - _CUT) * off:
-            moved = eliminated(system, there / np.linalg.norm(there), point.r, nonnegative=nonnegative)
-            rises.append((moved.objective - point.objective) / variance)
+    for there in (point.v + step, point.v - step):
+        v = np.maximum(there, 0.0) if nonnegative else there
+        moved = (v - point.v).ravel(order="F")
+        foretold = float(moved @ normal @ moved)
+        if foretold > 0:
+            risen = eliminated(system, v / np.linalg.norm(v), point.r, nonnegative=nonnegative)
+            rises.append((risen.objective - point.objective) / foretold)
     return min(rises)
 
 

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from wallmirror.derendering.bounds import cramer_rao
 from wallmirror.derendering.elimination import restricted
@@ -29,9 +28,9 @@ _BEYOND = 5.0
 # Correlation of neighbouring pixels beyond which a misfit is no noise, and beyond which it is no chance, in units of
 # 1 / sqrt(pixels), by which that of independent ones scatters.
 _SMOOTH, _CHANCE = 0.25, 5.0
-# Rise of the misfit, in variances of the noise, below which a pattern is no rarer than once in a thousand times: chi-squared
-# in the one degree of freedom that leads to it (Bates and Watts 1988, chapter 6, on bars that a profile does not bear out).
-_STEEP = float(chi2.isf(1e-3, 1))
+# Share of the parabola's rise at five error bars below which a pattern there is as likely as bars a root of two wider would
+# have it (Bates and Watts 1988, chapter 6, on bars that a profile does not bear out).
+_BORNE_OUT = 0.5
 
 
 def solve_scarce(
@@ -91,10 +90,10 @@ def solve_scarce(
     estimate = _weighed(
         problem, grid, found.designs, start, found.closed, priors, nonnegative=nonnegative, support=support
     )
-    if found.rise < _STEEP:
+    if found.rise < _BORNE_OUT:
         doubt = (
-            "a pattern five error bars from the one found explains the captures nearly as well, which these bars, "
-            "drawn at that one, do not know; capture more different patterns, more views or more light"
+            "a pattern five error bars from the one found explains the captures better than these bars, which are "
+            "drawn at that one, would have it; capture more different patterns, more views or more light"
         )
         estimate = replace(estimate, warnings=(*estimate.warnings, doubt))
     return estimate, [replace(estimate, coefficients=r, source=v) for r, v in found.others]
