@@ -15,6 +15,7 @@ from wallmirror.brdf import CookTorrance, Fresnel
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering import scarce
 from wallmirror.derendering.few_captures import FewCaptures, few_captures
+from wallmirror.derendering.problem import prepare
 from wallmirror.derendering.rivals import LEVEL, better_by_chance
 from wallmirror.derendering.solution import Solution
 from wallmirror.derendering.solve import solve
@@ -25,8 +26,9 @@ from .helpers import assert_undetermined, up_to_scale
 
 Array = NDArray[np.float64]
 
-# `wallmirror.derendering.solve` as an attribute may be the function.
+# The modules, whose functions have their names.
 solving = importlib.import_module("wallmirror.derendering.solve")
+searching = importlib.import_module("wallmirror.derendering.few_captures")
 
 # Held to the angle sum, a pattern 85 % off explains the films of this wall of facets five times better than the true one.
 SOURCE = np.array([[0.672, 0.074], [0.615, 0.227], [0.633, 0.984], [0.917, 0.719]])
@@ -125,3 +127,10 @@ def test_noise_lets_free_numbers_explain_no_more_than_the_threshold() -> None:
         assert np.count_nonzero(draws > better_by_chance(numbers)) <= 1
     # The level itself, where the sum has a closed form: two numbers, exp(-t / 2).
     assert better_by_chance(2) == pytest.approx(-2 * math.log(LEVEL), rel=1e-12)
+
+
+def test_more_starts_are_tried_where_the_ends_disagree(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, _ = prepare(films(6, 55), few_captures=True)
+    assert few_captures(problem, steps=(2.0,)).starts == 48
+    monkeypatch.setattr(searching, "disagree", lambda _: False)
+    assert few_captures(problem, steps=(2.0,)).starts == 24
