@@ -184,7 +184,7 @@ def build_system(problem: Problem, step_deg: float, *, degree: int, support: flo
 
 def climb(system: System, v: Array, r: Array | None, *, nonnegative: bool) -> Point:
     """Levenberg-Marquardt on V from a pattern (M, B); r, if given, tells which coefficients are likely above zero."""
-    here = _eliminated(system, v / np.linalg.norm(v), r, nonnegative=nonnegative)
+    here = eliminated(system, v / np.linalg.norm(v), r, nonnegative=nonnegative)
     damping = 1e-2
     for _ in range(_STEPS):
         free = (here.v > 0) | (here.transport.T @ here.missed > 0) if nonnegative else np.ones_like(here.v, dtype=bool)
@@ -200,7 +200,7 @@ def climb(system: System, v: Array, r: Array | None, *, nonnegative: bool) -> Po
             step = minimise_above(-at, damped, slope) if nonnegative else np.linalg.solve(damped, slope)
             v = (at + step).reshape(here.v.shape, order="F")
             norm = float(np.linalg.norm(v))
-            there = _eliminated(system, v / norm, here.r, nonnegative=nonnegative) if norm > 0 else here
+            there = eliminated(system, v / norm, here.r, nonnegative=nonnegative) if norm > 0 else here
             if there.objective < here.objective or damping > 1e6 or np.linalg.norm(step) < 1e-15:
                 break
             damping *= 8
@@ -213,7 +213,7 @@ def climb(system: System, v: Array, r: Array | None, *, nonnegative: bool) -> Po
     return here
 
 
-def _eliminated(system: System, v: Array, likely: Array | None, *, nonnegative: bool) -> Point:
+def eliminated(system: System, v: Array, likely: Array | None, *, nonnegative: bool) -> Point:
     """The best r for a pattern, with one step of refinement from the pixels' own residual."""
     gram = system.gram(v)
     right = np.einsum("ikb,ib->k", system.cross, v)

@@ -10,7 +10,7 @@ reached explains the data as well, and if no small change of it goes unseen; oth
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,13 +21,15 @@ from wallmirror.derendering.elimination import (
     Point,
     System,
     build_system,
-    climb,
+    eliminated,
     normal_of_pattern,
     reciprocal_condition,
     restricted,
 )
+from wallmirror.derendering.ends import APART, ROUNDING, End, disagree, distinct, in_question, pays, refined, search
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.problem import Problem
+from wallmirror.derendering.rivals import BARS, SAME, better_by_chance
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm
 from wallmirror.errors import InputError, UndeterminedError
@@ -44,18 +46,12 @@ _MOST_ENTRIES = 60_000_000
 _SINGULAR = 1e-12
 # S is a difference that ends at rounding, so that its singular values, roots of it, end near 1e-8.
 _FLAT = 1e-7
-_ROUNDING = 1e-13
-# Two patterns nearer to each other than this are one.
-_SAME = 1e-3
-# Misfits that differ by less than this many units of the noise's variance (or this share) do not tell patterns apart.
-_DECISIVE = 50.0
+# Misfits that differ by less than this share do not tell patterns apart, however many pixels they are summed over.
 _DECISIVE_SHARE = 5e-3
 # Below this residual what is left is the spline's own error, which follows no statistics.
 _SYSTEMATIC = 1e-6
-# Patterns within the noise of each other are one as well, but never those that differ by more than this.
-_APART = 0.2
-_CARRIED = 6
-_HOPELESS = 10.0
+# Ends that a finer grid is tried on.
+_REFINED = 6
 _UNDETERMINED = 0.5
 
 
@@ -79,6 +75,11 @@ class FewCaptures:
         Random starts tried, and how many of them ended at this pattern.
     exposure:
         How well each coefficient is seen, 1 for the best-seen, shape (K,).
+    others:
+        r and V of the other patterns that starts ended at and that explain the films not much worse, the best first.
+    rise:
+        Rise of the misfit where the pattern is off by five error bars along what is seen least, over that of the parabola
+        which the bars stand for, the less of both ways: 1 where they hold; inf where no pattern lies there.
     """
 
     grid: SplineGrid
@@ -92,6 +93,8 @@ class FewCaptures:
     starts: int
     agreeing: int
     exposure: Array
+    others: tuple[tuple[Array, Array], ...]
+    rise: float
 
     @property
     def closed(self) -> ClosedForm:
@@ -108,12 +111,6 @@ class FewCaptures:
             family=self.coefficients[:, None],
             beyond=min(gap, 1.0),
         )
-
-
-@dataclass
-class _Candidate:
-    point: Point
-    reached: int
 
 
 def few_captures(
@@ -135,7 +132,8 @@ def few_captures(
     support:
         rho(u) = 0 for |u| > support, in radians.
     starts:
-        Random patterns to start from; up to four times as many when fewer than three end at the best.
+        Random patterns to start from; twice as many when they end at patterns far apart of similar misfits, up to four
+        times as many when fewer than three end at the best.
     seed:
         Of the random patterns.
     steps:
@@ -162,19 +160,19 @@ def few_captures(
             "pixels, views or captures"
         )
     rng = np.random.default_rng(seed)
-    candidates = _search(system, problem.card.elements, [], rng, starts, nonnegative=nonnegative)
+    candidates = search(system, problem.card.elements, [], rng, starts, nonnegative=nonnegative)
     tried = starts
     if reciprocal_condition(candidates[0].point) < _SINGULAR:
         raise UndeterminedError(
             f"the captures leave the BRDF undetermined even where the pattern is known; {help_from}"
         )
     _slopes(system, candidates[0].point, help_from)
-    while candidates[0].reached < 3 and tried < 4 * starts:
-        candidates = _search(system, problem.card.elements, candidates, rng, starts, nonnegative=nonnegative)
+    while tried < 4 * starts and (candidates[0].reached < 3 or (tried < 2 * starts and disagree(candidates))):
+        candidates = search(system, problem.card.elements, candidates, rng, starts, nonnegative=nonnegative)
         tried += starts
     for step in steps[1:]:
         best = candidates[0].point
-        if math.sqrt(best.objective) < _ROUNDING:
+        if math.sqrt(best.objective) < ROUNDING:
             break
         ratio = system.grid.step / math.radians(step)
         if system.cells.size * ratio > _MOST_CELLS or system.values.size * ratio**2 > _MOST_ENTRIES:
@@ -182,90 +180,41 @@ def few_captures(
         finer = build_system(problem, step, degree=degree, support=support)
         if finer.freedom <= 0:
             break
-        refined = _distinct(_refine(finer, system, c, nonnegative=nonnegative) for c in _in_question(candidates))
-        if not _pays(best, refined[0].point, finer) or reciprocal_condition(refined[0].point) < _SINGULAR:
+        finest = distinct(
+            refined(finer, system, c, nonnegative=nonnegative) for c in in_question(candidates)[:_REFINED]
+        )
+        if not pays(best, finest[0].point, finer) or reciprocal_condition(finest[0].point) < _SINGULAR:
             break  # noise, or cells finer than the pixels
-        system, candidates = finer, refined
-    return _judged(problem, system, candidates, tried, help_from, degree=degree, support=support)
-
-
-def _search(
-    system: System,
-    elements: int,
-    found: list[_Candidate],
-    rng: np.random.Generator,
-    starts: int,
-    *,
-    nonnegative: bool,
-) -> list[_Candidate]:
-    """What is found already, and what some more random patterns lead to."""
-    shape = (elements, system.data.shape[1])
-    for n in range(starts):
-        # Every other start is uneven: patterns of few bright elements lie in corners that even ones seldom reach.
-        v = rng.random(shape) ** (1 + 3 * (n % 2)) if nonnegative else rng.standard_normal(shape)
-        found = _distinct([*found, _Candidate(climb(system, v, None, nonnegative=nonnegative), 1)])
-    return found
-
-
-def _refine(system: System, coarse: System, candidate: _Candidate, *, nonnegative: bool) -> _Candidate:
-    """The same pattern on a finer grid, from the coarse BRDF."""
-    whole = np.zeros(coarse.grid.size)
-    whole[coarse.cells] = candidate.point.r / coarse.scale
-    r = system.grid.interpolate(lambda u: coarse.grid.evaluate(whole, u))[system.cells] * system.scale
-    return _Candidate(climb(system, candidate.point.v, r, nonnegative=nonnegative), candidate.reached)
-
-
-def _distinct(candidates: Iterable[_Candidate]) -> list[_Candidate]:
-    """Different patterns, best first, each with the number of starts that ended there."""
-    kept: list[_Candidate] = []
-    for candidate in sorted(candidates, key=lambda c: c.point.objective):
-        twin = next((k for k in kept if scale_free_error(candidate.point.v, k.point.v) < _SAME), None)
-        if twin is None:
-            kept.append(_Candidate(candidate.point, candidate.reached))
-        else:
-            twin.reached += candidate.reached
-    return kept[:_CARRIED]
-
-
-def _in_question(candidates: list[_Candidate]) -> list[_Candidate]:
-    """Those whose misfit a finer grid might still bring down to the best's."""
-    return [
-        c for c in candidates if c.point.objective <= _HOPELESS**2 * max(candidates[0].point.objective, _ROUNDING**2)
-    ]
-
-
-def _pays(coarse: Point, fine: Point, system: System) -> bool:
-    """Whether the finer grid explains more than as many coefficients would of noise (Akaike 1974)."""
-    added = max(1, fine.free.size - coarse.free.size)
-    return coarse.objective - fine.objective > 2 * added * fine.objective / max(1, system.freedom)
+        system, candidates = finer, finest
+    return _judged(
+        problem, system, candidates, tried, help_from, degree=degree, support=support, nonnegative=nonnegative
+    )
 
 
 def _judged(
     problem: Problem,
     system: System,
-    candidates: list[_Candidate],
+    candidates: list[End],
     tried: int,
     help_from: str,
     *,
     degree: int,
     support: float | None,
+    nonnegative: bool,
 ) -> FewCaptures:
     """The best candidate, if the others and its own neighbourhood leave it alone."""
     best = candidates[0].point
     steepest, flat = _slopes(system, best, help_from)
     residual = math.sqrt(best.objective)
-    noise = residual / math.sqrt(max(1, system.freedom))
-    apart = min(max(_SAME, 3 * noise / flat), _APART)
+    bars, normal, least = _bars(system, best)
+    apart = min(max(SAME, BARS * bars), APART)
     for other in candidates[1:]:
-        if scale_free_error(other.point.v, best.v) > apart and _as_good(other.point.objective, best.objective, system):
+        if scale_free_error(other.point.v, best.v) > apart and _as_good(other.point, best, system):
             raise UndeterminedError(
                 f"patterns that differ by {100 * scale_free_error(other.point.v, best.v):.2g} % explain the captures "
                 f"equally well (residuals {residual:.2g} and {math.sqrt(other.point.objective):.2g}); {help_from}"
             )
-    r = np.zeros(system.grid.size)
-    r[system.cells] = best.r / system.scale
-    source = best.v * float(np.linalg.norm(problem.weighted_data))
-    sign = -1.0 if source.sum() < 0 else 1.0
+    r, source = _unscaled(problem, system, best)
     grid, designs = problem.designs(math.degrees(system.grid.step), degree=degree, tolerance=1e-9)
     designs = restricted(grid, designs, support)
     exposure = np.zeros(grid.size)
@@ -273,16 +222,52 @@ def _judged(
     return FewCaptures(
         grid=grid,
         designs=designs,
-        coefficients=sign * r,
-        source=sign * source,
-        transport=np.stack([t @ (sign * r) for t in designs], axis=1),
+        coefficients=r,
+        source=source,
+        transport=np.stack([t @ r for t in designs], axis=1),
         residual=residual,
         gap=flat / steepest,
         error=residual / flat,
         starts=tried,
         agreeing=candidates[0].reached,
         exposure=exposure,
+        others=tuple(_unscaled(problem, system, c.point) for c in in_question(candidates)[1:]),
+        rise=_rise(system, best, normal, least, BARS * bars, nonnegative=nonnegative),
     )
+
+
+def _unscaled(problem: Problem, system: System, point: Point) -> tuple[Array, Array]:
+    """r (K,) and V (M, B) of a point in the scale of the problem's data, the light positive."""
+    r = np.zeros(system.grid.size)
+    r[system.cells] = point.r / system.scale
+    source = point.v * float(np.linalg.norm(problem.weighted_data))
+    sign = -1.0 if source.sum() < 0 else 1.0
+    return sign * r, sign * source
+
+
+def _bars(system: System, point: Point) -> tuple[float, Array, Array]:
+    """The relative error of V that noise as large as the misfit makes, S, and the direction that is seen least, (M, B)."""
+    normal, _ = normal_of_pattern(system, point, np.ones_like(point.v, dtype=bool))
+    values, vectors = np.linalg.eigh(normal)
+    variance = point.objective / max(1, system.freedom)
+    bars = math.sqrt(variance * float(np.sum(1 / np.maximum(values[1:], 1e-300))))
+    return bars, normal, vectors[:, min(1, values.size - 1)].reshape(point.v.shape, order="F")
+
+
+def _rise(system: System, point: Point, normal: Array, least: Array, off: float, *, nonnegative: bool) -> float:
+    """What the misfit rises by where V is that far off, over what the parabola with the curvature S does."""
+    if off >= 1 or point.objective == 0:
+        return math.inf  # no pattern is as far off as that
+    step = least * off / math.sqrt(1 - off * off)
+    rises = [math.inf]
+    for there in (point.v + step, point.v - step):
+        v = np.maximum(there, 0.0) if nonnegative else there
+        moved = (v - point.v).ravel(order="F")
+        foretold = float(moved @ normal @ moved)
+        if foretold > 0:
+            risen = eliminated(system, v / np.linalg.norm(v), point.r, nonnegative=nonnegative)
+            rises.append((risen.objective - point.objective) / foretold)
+    return min(rises)
 
 
 def _slopes(system: System, point: Point, help_from: str) -> tuple[float, float]:
@@ -303,13 +288,13 @@ def _slopes(system: System, point: Point, help_from: str) -> tuple[float, float]
     return steepest, flat
 
 
-def _as_good(other: float, best: float, system: System) -> bool:
+def _as_good(other: Point, best: Point, system: System) -> bool:
     """Whether the misfits leave it open which of two patterns is the true one."""
-    if math.sqrt(best) < _SYSTEMATIC:
-        return math.sqrt(other) < 10 * max(math.sqrt(best), _ROUNDING)
-    # A wrong pattern may leave more coefficients above their bounds, and each of them takes up a unit of noise.
-    decisive = (_DECISIVE + 2 * system.cells.size) / max(1, system.freedom)
-    return other < best * (1 + max(decisive, _DECISIVE_SHARE))
+    if math.sqrt(best.objective) < _SYSTEMATIC:
+        return math.sqrt(other.objective) < 10 * max(math.sqrt(best.objective), ROUNDING)
+    # Were the other one true, the best might be better by what its free numbers take up of the noise (`rivals`).
+    decisive = better_by_chance(best.free.size + best.v.size - 1) / max(1, system.freedom)
+    return other.objective < best.objective * (1 + max(decisive, _DECISIVE_SHARE))
 
 
 def _help(*, nonnegative: bool, support: float | None) -> str:

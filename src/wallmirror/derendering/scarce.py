@@ -28,6 +28,9 @@ _BEYOND = 5.0
 # Correlation of neighbouring pixels beyond which a misfit is no noise, and beyond which it is no chance, in units of
 # 1 / sqrt(pixels), by which that of independent ones scatters.
 _SMOOTH, _CHANCE = 0.25, 5.0
+# Share of the parabola's rise at five error bars below which a pattern there is as likely as bars a root of two wider would
+# have it (Bates and Watts 1988, chapter 6, on bars that a profile does not bear out).
+_BORNE_OUT = 0.5
 
 
 def solve_scarce(
@@ -38,13 +41,17 @@ def solve_scarce(
     step_deg: float | None,
     seed: int,
     tell: Callable[[str], None] = lambda _: None,
-) -> Estimate:
+) -> tuple[Estimate, list[Estimate]]:
     """Search from random patterns; where there is noise, climb to the likelihood's maximum from what was found.
 
     Parameters
     ----------
     support:
         rho(u) = 0 for |u| > support, in radians.
+
+    Returns
+    -------
+    The estimate, and where there is noise the same with each of the other patterns that the search ended at, for `rivals`.
 
     Raises
     ------
@@ -61,7 +68,7 @@ def solve_scarce(
         spread = np.full(found.source.shape, found.error * math.sqrt(float(np.mean(found.source**2))))
         peak_at = grid.peak(found.coefficients, found.exposure)
         height = float(grid.evaluate(found.coefficients, peak_at))
-        return Estimate(
+        estimate = Estimate(
             method="few_captures",
             grid=grid,
             closed=found.closed,
@@ -78,9 +85,18 @@ def solve_scarce(
             priors=tuple(priors),
             designs=found.designs,
         )
-    return _weighed(
-        problem, grid, found.designs, found.source, found.closed, priors, nonnegative=nonnegative, support=support
+        return estimate, []
+    start = (found.coefficients, found.source)
+    estimate = _weighed(
+        problem, grid, found.designs, start, found.closed, priors, nonnegative=nonnegative, support=support
     )
+    if found.rise < _BORNE_OUT:
+        doubt = (
+            "a pattern five error bars from the one found explains the captures better than these bars, which are "
+            "drawn at that one, would have it; capture more different patterns, more views or more light"
+        )
+        estimate = replace(estimate, warnings=(*estimate.warnings, doubt))
+    return estimate, [replace(estimate, coefficients=r, source=v) for r, v in found.others]
 
 
 def refit_scarce(problem: Problem, before: Estimate, *, nonnegative: bool, support: float | None) -> Estimate:
@@ -94,8 +110,9 @@ def refit_scarce(problem: Problem, before: Estimate, *, nonnegative: bool, suppo
     step = math.degrees(before.grid.step)
     grid, designs = problem.designs(step, degree=before.grid.degree, tolerance=1e-9)
     designs = restricted(grid, designs, support)
+    start = (before.coefficients, before.source)
     return _weighed(
-        problem, grid, designs, before.source, before.closed, before.priors, nonnegative=nonnegative, support=support
+        problem, grid, designs, start, before.closed, before.priors, nonnegative=nonnegative, support=support
     )
 
 
@@ -103,16 +120,16 @@ def _weighed(
     problem: Problem,
     grid: SplineGrid,
     designs: list[sp.csr_array],
-    source: Array,
+    start: tuple[Array, Array],
     closed: ClosedForm,
     priors: Sequence[str],
     *,
     nonnegative: bool,
     support: float | None,
 ) -> Estimate:
-    """The maximum of the likelihood next to a pattern, with its bound and its doubts."""
+    """The maximum of the likelihood next to r and V, with its bound and its doubts."""
     summed = moments(problem.data, designs, problem.inverse_variance)
-    fit = maximise(summed, best_nonnegative(summed, source), nonnegative=nonnegative)
+    fit = maximise(summed, best_nonnegative(summed, start[1]), start[0], nonnegative=nonnegative)
     transport = np.stack([t @ fit.coefficients for t in designs], axis=1)
     unknowns = int(np.count_nonzero(fit.coefficients)) + fit.source.size
     reduced = reduced_misfit(problem, transport, fit.source, unknowns)

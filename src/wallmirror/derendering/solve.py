@@ -28,6 +28,7 @@ from wallmirror.derendering.noisy import solve_noisy
 from wallmirror.derendering.one_bounce import check_one_bounce
 from wallmirror.derendering.placed import widened
 from wallmirror.derendering.problem import ROUNDING, Problem, expected_mismatch, prepare
+from wallmirror.derendering.rivals import hold_against_rivals
 from wallmirror.derendering.scarce import refit_scarce, solve_scarce
 from wallmirror.derendering.solution import UNDETERMINED, Gauge, Scale, Solution, conclude
 from wallmirror.derendering.subspace import SignalSpace
@@ -182,22 +183,20 @@ def solve(
             further = check_one_bounce(problem, estimate, wall_albedo=wall_albedo)
             return 0.0 if further is None else further.bias
 
-        settle = partial(
-            settle_wall,
-            # A scale that an albedo settles is that of a function of the angle sum.
-            wall="angle_sum" if wall == "auto" and scale == "albedo" else wall,
-            foretold=foretold,
-            tell=tell,
-        )
+        # A scale that an albedo settles is that of a function of the angle sum.
+        model: WallModel = "angle_sum" if wall == "auto" and scale == "albedo" else wall
+        settle = partial(settle_wall, wall=model, foretold=foretold, tell=tell)
         estimate = exact = angle_sum = None
         quiet = False
         if few:
             tell(f"{captures.realisations} captures for {captures.card.elements} elements: search for few captures")
             support = None if support_deg is None else math.radians(support_deg)
-            estimate = solve_scarce(
-                problem, nonnegative=nonnegative, support=support, step_deg=step_deg, seed=seed, tell=tell
+            search = partial(
+                solve_scarce, nonnegative=nonnegative, support=support, step_deg=step_deg, seed=seed, tell=tell
             )
-            refit = partial(refit_scarce, before=estimate, nonnegative=nonnegative, support=support)
+            estimate, rivals = search(problem)
+            refit_next_to = partial(refit_scarce, nonnegative=nonnegative, support=support)
+            refit = partial(refit_next_to, before=estimate)
         elif method == "closed_form" or (method == "auto" and _may_be_exact(problem, space)):
             tell(f"rank {space.rank} of {captures.card.elements}, no noise stated: closed form")
             exact = closed(problem)
@@ -232,7 +231,20 @@ def solve(
             if estimate.groups:  # no facets are fitted to scales that are open
                 angle_sum = check_angle_sum(problem, estimate)
             else:
+                plain = problem
                 problem, estimate, angle_sum = settle(problem, estimate, refit if few else fit, check_angle_sum)
+                if few:
+                    problem, estimate, angle_sum = hold_against_rivals(
+                        plain,
+                        (problem, estimate, angle_sum),
+                        rivals,
+                        refit_next_to,
+                        check_angle_sum,
+                        lambda problem: search(problem)[0],
+                        wall=model,
+                        excused=foretold(plain, estimate) if rivals else 0.0,
+                        tell=tell,
+                    )
         if angle_sum is not None:
             estimate = with_doubt(estimate, angle_sum)
         if calibration is not None:
