@@ -176,7 +176,7 @@ def _first_worth_a_fit(ladder: Ladder, nonnegative: bool) -> int:
 
     Coarser ones are far from explaining the films, and a fit on them would only be a start for the next. Where finer ones
     miss as much, it is not for the knots; where none comes near, or the noise is not known, the search begins with the
-    coarsest.
+    coarsest. Mismatches as a whole do not show a spline's error that a fit would: that is foretold from the detail of rho.
     """
     if ladder.space.rank < ladder.problem.card.elements:
         return 0
