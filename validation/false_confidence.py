@@ -55,8 +55,8 @@ from wallmirror.derendering.bounds import cramer_rao
 from wallmirror.derendering.elimination import restricted
 from wallmirror.derendering.foresight import closest_spline
 from wallmirror.derendering.moments import moments
+from wallmirror.derendering.options import SolveOptions
 from wallmirror.derendering.problem import prepare
-from wallmirror.derendering.solve import SolveOptions
 from wallmirror.files import write_atomically
 
 WallModel = Literal["angle_sum", "microfacet", "auto"]

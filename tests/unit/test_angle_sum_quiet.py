@@ -15,13 +15,14 @@ from wallmirror.brdf import BRDF, CookTorrance, Diffuse, Fresnel, GaussianTrain,
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.angle_sum_check import LEVEL, SLIGHT, AngleSumCheck, with_doubt
 from wallmirror.derendering.angle_sum_quiet import check_angle_sum_quietly
+from wallmirror.derendering.conclusion import conclude
 from wallmirror.derendering.estimate import Estimate, scale_free_error
 from wallmirror.derendering.exact import solve_exactly
 from wallmirror.derendering.facet_fit import settle_wall
 from wallmirror.derendering.facets import FITTED, weighted
+from wallmirror.derendering.gauge import Gauge
 from wallmirror.derendering.noisy import solve_noisy
 from wallmirror.derendering.problem import Problem, prepare
-from wallmirror.derendering.solution import Gauge, conclude
 from wallmirror.derendering.solve import solve
 from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card, Observer, scan_angles

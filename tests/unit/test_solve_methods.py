@@ -17,9 +17,10 @@ from wallmirror.brdf import AngleSumBRDF, AngleSumTable, Diffuse, GaussianTrain,
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.components import components
 from wallmirror.derendering.estimate import scale_free_error
+from wallmirror.derendering.options import Method
 from wallmirror.derendering.problem import prepare
 from wallmirror.derendering.solution import Solution
-from wallmirror.derendering.solve import Method, solve
+from wallmirror.derendering.solve import solve
 from wallmirror.geometry import Card, Observer
 from wallmirror.transport import Weights, radiance, transport_matrix
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from wallmirror.brdf import AngleSumBRDF, Diffuse
 from wallmirror.captures import CaptureSet
-from wallmirror.derendering.solve import Method, solve
+from wallmirror.derendering.options import Method
+from wallmirror.derendering.solve import solve
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
 from wallmirror.derendering.subspace import ClosedForm, banded_gram, closed_form, signal_space
 from wallmirror.errors import UndeterminedError

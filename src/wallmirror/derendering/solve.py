@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Literal, TypedDict, cast, get_args
+from typing import cast
 
 from threadpoolctl import threadpool_limits
 
@@ -19,40 +19,23 @@ from wallmirror.captures import CaptureSet
 from wallmirror.derendering.angle_sum_check import check_angle_sum, with_doubt
 from wallmirror.derendering.angle_sum_quiet import check_angle_sum_quietly
 from wallmirror.derendering.calibration import Calibration
+from wallmirror.derendering.conclusion import UNDETERMINED, conclude
 from wallmirror.derendering.counting import prepare_counts, solve_counts
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.exact import solve_exactly
 from wallmirror.derendering.facet_fit import WallModel, settle_wall
+from wallmirror.derendering.gauge import Gauge, Scale
 from wallmirror.derendering.knots import NOISY_STEPS
 from wallmirror.derendering.noisy import solve_noisy
 from wallmirror.derendering.one_bounce import check_one_bounce
+from wallmirror.derendering.options import Method, require_options, require_wall
 from wallmirror.derendering.placed import widened
 from wallmirror.derendering.problem import ROUNDING, Problem, expected_mismatch, prepare
 from wallmirror.derendering.rivals import hold_against_rivals
 from wallmirror.derendering.scarce import refit_scarce, solve_scarce
-from wallmirror.derendering.solution import UNDETERMINED, Gauge, Scale, Solution, conclude
+from wallmirror.derendering.solution import Solution
 from wallmirror.derendering.subspace import SignalSpace
 from wallmirror.errors import InputError, UndeterminedError
-
-Method = Literal["auto", "closed_form", "maximum_likelihood", "few_captures", "poisson"]
-
-
-class SolveOptions(TypedDict, total=False):
-    """The options of `solve`, for functions that hand them on."""
-
-    method: Method
-    wall: WallModel
-    nonnegative: bool
-    support_deg: float | None
-    step_deg: float | None
-    counts_per_radiance: float | None
-    background: float
-    scale: Scale
-    wall_albedo: float | None
-    source_level: float | None
-    tolerance: float | None
-    seed: int
-
 
 # Below this mismatch the data count as free of noise: float64 renders end near 1e-24, float32 files near 1e-13.
 _NOISELESS = 1e-15
@@ -138,8 +121,8 @@ def solve(
     few = method == "few_captures" or (method == "auto" and captures.realisations < captures.card.elements)
     if tolerance is not None and not 0 < tolerance < 1:
         raise InputError(f"is {tolerance:g}; give a relative error between 0 and 1", field="tolerance")
-    _check_wall(wall, scale)
-    _check_options(method, few, support_deg, step_deg, counts_per_radiance, background, seed)
+    require_wall(wall, scale)
+    require_options(method, few, support_deg, step_deg, counts_per_radiance, background, seed)
     gauge = Gauge(scale=scale, wall_albedo=wall_albedo, source_level=source_level)
     steps = (step_deg,) if step_deg else None
     history: list[str] = []
@@ -280,43 +263,3 @@ def solve(
 
 def _may_be_exact(problem: Problem, space: SignalSpace) -> bool:
     return not problem.noise_is_stated and space.rank == problem.card.elements
-
-
-def _check_wall(wall: str, scale: str) -> None:
-    if wall not in get_args(WallModel):
-        raise InputError(f'is "{wall}"; choose one of {", ".join(get_args(WallModel))}', field="wall")
-    if wall == "microfacet" and scale == "albedo":
-        raise InputError("cannot be microfacet where an albedo settles the scale", field="wall")
-
-
-def _check_options(
-    method: str,
-    few: bool,
-    support_deg: float | None,
-    step_deg: float | None,
-    counts_per_radiance: float | None,
-    background: float,
-    seed: int,
-) -> None:
-    if method not in get_args(Method):
-        raise InputError(f'is "{method}"; choose one of {", ".join(get_args(Method))}', field="method")
-    if step_deg is not None and not 0.001 <= step_deg <= 45:
-        raise InputError(f"is {step_deg:g}; give a knot spacing from 0.001 to 45 degrees", field="step_deg")
-    if support_deg is not None and not few:
-        raise InputError("is a prior for few captures, which these are not; leave it out", field="support_deg")
-    if support_deg is not None and not 0 < support_deg <= 180:
-        raise InputError(
-            f"is {support_deg:g}; give the BRDF's largest angle sum, up to 180 degrees", field="support_deg"
-        )
-    if method == "poisson":
-        if counts_per_radiance is None or not 0 < counts_per_radiance < math.inf:
-            raise InputError(
-                "the poisson method needs the counts that a radiance of 1 makes", field="counts_per_radiance"
-            )
-    elif counts_per_radiance is not None or background != 0:
-        named = "background" if counts_per_radiance is None else "counts_per_radiance"
-        raise InputError("has a meaning for the poisson method alone; leave it out", field=named)
-    if not 0 <= background < math.inf:
-        raise InputError(f"is {background:g}; give mean counts >= 0", field="background")
-    if seed < 0:
-        raise InputError(f"is {seed}; give an integer >= 0", field="seed")

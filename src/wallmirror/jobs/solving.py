@@ -11,8 +11,9 @@ import numpy as np
 
 from wallmirror.captures import read_captures, read_truth
 from wallmirror.derendering.calibration import calibrate
+from wallmirror.derendering.options import SolveOptions
 from wallmirror.derendering.solution import Solution
-from wallmirror.derendering.solve import SolveOptions, solve
+from wallmirror.derendering.solve import solve
 from wallmirror.jobs.solution_files import csv_text, source_csv, write_results
 from wallmirror.jobs.solution_report import solution_sections, verdicts
 from wallmirror.jobs.solved import Solved, judge
