@@ -22,8 +22,7 @@ def transcendental_ratio(*, repeats: int = 9) -> tuple[float, float, int]:
     """Seconds of the physical model over those of its transcendental functions alone, in pairs.
 
     The functions are those that its formulas name, once a node: an exp for each lobe, arctan of theta_s, and of the strip's
-    mean a square root, two arctan and one arctan2; on the arguments that they have there, in place, and in blocks of the
-    same size.
+    mean a square root and two arctan2; on the arguments that they have there, in place, and in blocks of the same size.
 
     Returns
     -------
@@ -43,7 +42,7 @@ def transcendental_ratio(*, repeats: int = 9) -> tuple[float, float, int]:
         some, wall_x
     )
     square = 1 + slope * slope
-    small = 0.01 / np.sqrt(square)
+    ends = [np.sqrt(square) * (length / card.distance) for length in (0.01, card.element_height)]
     exponents = [np.maximum(-0.5 * ((u - centre) / brdf.sigma) ** 2, -703.0) for centre in brdf.centres]
     out = np.empty_like(slope)
     blocks = nodes / slope.size
@@ -51,9 +50,8 @@ def transcendental_ratio(*, repeats: int = 9) -> tuple[float, float, int]:
     def functions() -> None:
         np.arctan(slope, out=out)
         np.sqrt(square, out=out)
-        np.arctan(small, out=out)
-        np.arctan(small, out=out)
-        np.arctan2(small, square, out=out)
+        for end in ends:
+            np.arctan2(end, square, out=out)
         for exponent in exponents:
             np.exp(exponent, out=out)
 
