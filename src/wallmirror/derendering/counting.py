@@ -110,8 +110,10 @@ def solve_counts(
     sigma = math.sqrt(max(1.0, fit.chi_squared))
     transport = np.stack([t @ fit.coefficients for t in designs], axis=1)
     source = fit.source / unit
-    bound = trusted_bound(problem, level, transport, source, sigma=sigma, bound=bound_at(source), bound_at=bound_at)
-    warnings = doubts_of_fit(converged=fit.converged, misfit=None)
+    bound, doubts = trusted_bound(
+        problem, level, transport, source, sigma=sigma, bound=bound_at(source), bound_at=bound_at
+    )
+    warnings = [*doubts, *doubts_of_fit(converged=fit.converged, misfit=None)]
     if fit.chi_squared > 1.2:
         warnings.append(
             f"the counts scatter {fit.chi_squared:.2f} times as much as counting alone, so the model or the counts per "

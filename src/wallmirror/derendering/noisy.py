@@ -60,7 +60,7 @@ def solve_noisy(
     reduced = reduced_misfit(problem, transport, fit.source, level.parameters + fit.source.size)
     # Where the noise is stated, a misfit beyond it widens the bars; where it is not, the misfit is the noise.
     sigma = math.sqrt(max(1.0, reduced) if stated else reduced)
-    bound = trusted_bound(
+    bound, doubts = trusted_bound(
         problem, level, transport, fit.source, sigma=sigma, bound=level.bound, bound_at=level.bound_at
     )
     predicted = sigma * bound.source_error
@@ -77,6 +77,7 @@ def solve_noisy(
                 "the misfit still falls with finer knots than the captures allow, so it is no noise; the error bars are how "
                 "far the pattern moved when the knots were last halved"
             )
+    warnings += doubts
     warnings += doubts_of_fit(converged=fit.converged, misfit=reduced if stated else None)
     if level.strained:
         # What the bounds hold back turns the pattern by as much as they move it.

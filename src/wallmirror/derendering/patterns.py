@@ -23,13 +23,17 @@ from wallmirror.derendering.bounds import Bound
 from wallmirror.derendering.knots import Level
 from wallmirror.derendering.problem import Problem, too_few_patterns
 from wallmirror.derendering.splines import exposures
-from wallmirror.derendering.subspace import CERTAIN, LIKELY, noise_edge
+from wallmirror.derendering.subspace import CERTAIN, LIKELY, POSSIBLE, noise_edge
 
 Array = NDArray[np.float64]
 
 # Standard deviation of a coefficient that the other elements leave it, as a share of the largest that a fit without bounds has,
 # from which it is free: beside a false pattern, which is faint, coefficients of its own grow large.
 _FREE = 0.3
+_DOUBT = (
+    "the faintest of the patterns is one that noise alone makes once in ten to a hundred times, so that one element fewer may "
+    "be lit; the error bars do without it, and more light or more different patterns would tell"
+)
 
 
 def trusted_bound(
@@ -41,12 +45,12 @@ def trusted_bound(
     sigma: float,
     bound: Bound,
     bound_at: Callable[[Array], Bound],
-) -> Bound:
-    """The Cramer-Rao bound of a fit, at those of its patterns that are certainly no noise.
+) -> tuple[Bound, tuple[str, ...]]:
+    """The Cramer-Rao bound of a fit, at those of its patterns that are certainly no noise, and what has to be said of the rest.
 
-    A pattern that noise makes once in a hundred times is no answer. One that it makes more seldom, but not as seldom as once
-    in ten thousand, is taken for real, with error bars that do not count on it: with those patterns alone that are certain
-    the films must tell the BRDF as well.
+    A pattern that noise makes once in ten times is no answer. One that it makes more seldom, but not as seldom as once in
+    ten thousand, is taken for real, with error bars that do not count on it: with those patterns alone that are certain
+    the films must tell the BRDF as well. If noise makes it once in a hundred times, that is a doubt.
 
     Parameters
     ----------
@@ -68,21 +72,22 @@ def trusted_bound(
     size = (transport.shape[0], source.shape[1], free_coefficients(problem, level, source, sigma))
     certain = standing_out(strength / sigma, *size)
     if certain == elements:
-        return bound
+        return bound, ()
     # Bounds weaken patterns, false ones and true ones. What noise makes of one is known without them alone.
     free = np.stack([t @ level.free.coefficients for t in level.designs], axis=1)
     unbounded = np.linalg.svd(np.linalg.qr(problem.row_weights * free, mode="r") @ level.free.source, compute_uv=False)
     certain = max(certain, standing_out(unbounded / sigma, *size))
-    likely = standing_out(unbounded / sigma, *size, units=LIKELY)
-    if likely < elements:
-        raise too_few_patterns(likely, elements)
+    possible = standing_out(unbounded / sigma, *size, units=POSSIBLE)
+    if possible < elements:
+        raise too_few_patterns(possible, elements)
     if certain == elements:
-        return bound
+        return bound, ()
+    likely = standing_out(unbounded / sigma, *size, units=LIKELY)
     kept = np.linalg.lstsq(triangle, (left[:, :certain] * strength[:certain]) @ right[:certain], rcond=None)[0]
     wide = max(bound, bound_at(kept), key=lambda each: each.source_error)
     if not math.isfinite(wide.source_error):
         raise too_few_patterns(certain, elements)
-    return wide
+    return wide, (_DOUBT,) if likely < elements else ()
 
 
 def standing_out(strength: Array, rows: int, realisations: int, free: int, units: float = CERTAIN) -> int:

@@ -27,8 +27,8 @@ _RIDGE = 1e-13
 _NO_RIVAL = 0.01
 
 
-#: Quantiles of the law of Tracy and Widom for real matrices: passed once in ten thousand times, and once in a hundred.
-CERTAIN, LIKELY = 4.4, 2.02
+#: Quantiles of the law of Tracy and Widom for real matrices: passed once in ten thousand, a hundred and ten times.
+CERTAIN, LIKELY, POSSIBLE = 4.4, 2.02, 0.45
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def noise_edge(rows: int, columns: int, units: float = CERTAIN) -> float:
 
     The edge sqrt(rows) + sqrt(columns) of Marchenko and Pastur (1967), and beyond it some units of the scale on which the
     largest eigenvalue scatters by the law of Tracy and Widom (Johnstone, Annals of Statistics 29(2), 2001): `CERTAIN`, or
-    `LIKELY` for one case of a hundred.
+    `LIKELY` for one case of a hundred, or `POSSIBLE` for one of ten.
     """
     edge = math.sqrt(rows) + math.sqrt(columns)
     scale = edge * (1 / math.sqrt(rows) + 1 / math.sqrt(columns)) ** (1 / 3)
