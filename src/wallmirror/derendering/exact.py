@@ -28,6 +28,8 @@ _EXACT = 3e-23
 _ROUNDING = 1e-15
 # A gap that leaves no doubt: knots that reach rounding with it need no others beside them.
 _CLEAR = 1e-3
+# Numbers in r per equation up to which a mismatch of rounding's size says something.
+_TOLD = 0.9
 # Knots whose own bound is above this have no say in how far the pattern moves.
 _WORTH_A_LOOK = 0.1
 
@@ -37,6 +39,17 @@ class _Try:
     grid: SplineGrid
     closed: ClosedForm
     designs: list[sp.csr_array]
+    rows: int
+
+    @property
+    def error(self) -> float:
+        """The closed form's bound on r; none where the equations (I - U U^T) T_i r = 0 are hardly more than the numbers in r.
+
+        Such knots fit any films to rounding, noise and all.
+        """
+        elements = len(self.designs)
+        told = int(np.count_nonzero(self.closed.exposure > 0)) < _TOLD * elements * (self.rows - elements)
+        return self.closed.error if told else math.inf
 
 
 def solve_exactly(problem: Problem, space: SignalSpace, *, step_deg: float | None = None) -> Estimate:
@@ -61,10 +74,10 @@ def solve_exactly(problem: Problem, space: SignalSpace, *, step_deg: float | Non
         if separated is not None:
             return _in_groups(problem, best, separated)
     condition = float(np.linalg.cond(closed.transport))
-    error = max(closed.error, _ROUNDING * condition)
+    error = max(best.error, _ROUNDING * condition)
     rivals = [other for other in others if other.error < _WORTH_A_LOOK]
     if rivals:
-        error = max(error, scale_free_error(closed.source, min(rivals, key=lambda other: other.error).source))
+        error = max(error, scale_free_error(closed.source, min(rivals, key=lambda other: other.error).closed.source))
     elif others:
         error *= condition  # the worst that an error of r does to V
     warnings: tuple[str, ...] = ()
@@ -122,32 +135,33 @@ def _in_groups(problem: Problem, best: _Try, found: Separated) -> Estimate:
     )
 
 
-def _search(problem: Problem, space: SignalSpace, step_deg: float | None) -> tuple[_Try, list[ClosedForm]]:
-    """The best knots, and the closed forms on the others that were tried."""
+def _search(problem: Problem, space: SignalSpace, step_deg: float | None) -> tuple[_Try, list[_Try]]:
+    """The best knots, and the others that were tried."""
 
     def at(step: float) -> _Try:
         grid, designs = problem.designs(step, degree=_DEGREE, tolerance=1e-9)
-        return _Try(grid, closed_form(problem.weighted_data, problem.weighted(designs), space), designs)
+        rows = int(np.count_nonzero(np.any(problem.fit_weights > 0, axis=1)))
+        return _Try(grid, closed_form(problem.weighted_data, problem.weighted(designs), space), designs, rows)
 
     if step_deg is not None:
         return at(step_deg), []
     first = best = at(EXACT_STEPS[0])
-    others: list[ClosedForm] = []
+    others: list[_Try] = []
     for steps in (EXACT_STEPS[1:], COARSER_STEPS):
         if best is not first:
             break  # finer knots paid, so coarser ones cannot
         for step in steps:
-            if best.closed.mismatch < _EXACT and best.closed.gap > _CLEAR:
+            if best.closed.mismatch < _EXACT and best.closed.gap > _CLEAR and best.error < math.inf:
                 return best, others
             if best.closed.mismatch < _EXACT and steps is not COARSER_STEPS:
                 break  # these fit whatever there is
             # Not the mismatch alone: a grid finer than the pixels fits anything, and its gap says so.
             other = at(step)
-            if not other.closed.error < best.closed.error / 2:
-                others.append(other.closed)
-                if steps is COARSER_STEPS and best.closed.error > _WORTH_A_LOOK:
+            if not other.error < best.error / 2:
+                others.append(other)
+                if steps is COARSER_STEPS and best.error > _WORTH_A_LOOK:
                     continue  # all knots so far are finer than the pixels
                 break
-            others.append(best.closed)
+            others.append(best)
             best = other
     return best, others

@@ -77,7 +77,6 @@ def solve_noisy(
                 "the misfit still falls with finer knots than the captures allow, so it is no noise; the error bars are how "
                 "far the pattern moved when the knots were last halved"
             )
-    warnings += doubts
     warnings += doubts_of_fit(converged=fit.converged, misfit=reduced if stated else None)
     if level.strained:
         # What the bounds hold back turns the pattern by as much as they move it.
@@ -99,6 +98,7 @@ def solve_noisy(
             )
     if apart:
         warnings.append(in_words(apart))
+    warnings += doubts
     return Estimate(
         method="maximum_likelihood",
         grid=grid,
