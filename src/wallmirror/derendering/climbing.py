@@ -109,7 +109,7 @@ def _needed(ladder: Ladder, index: int, fit: Fit, tell: Tell) -> bool:
     """Whether coarser knots than a fit's would miss so much more than noise does that no fit on them is called for."""
     summed = ladder.summed(index)
     halved = sp.csr_array(ladder.grids[index - 1].in_halved()[summed.seen])
-    schur = information(summed, fit.coefficients, fit.source, fit.schur).schur
+    schur = information(summed, fit.coefficients, fit.source).schur if fit.schur is None else fit.schur
     pull = np.einsum("ib,bik->k", fit.source, summed.cross)[summed.seen]
     lost = loss(schur, fit.coefficients[summed.seen], pull, halved)
     freedom = ladder.freedom(index)
