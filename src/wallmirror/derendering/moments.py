@@ -59,6 +59,16 @@ class Pairs:
         every = sp.csr_array(sp.kron(sp.eye_array(self.above.shape[0] // self.size), halved, format="csr"))
         return Pairs(sp.csr_array(every.T.tocsr() @ (self.above @ every)), self.elements)
 
+    def whole(self) -> sp.csr_array:
+        """[T_1 .. T_M]^T W [T_1 .. T_M], sparse (M K, M K)."""
+        i, j = self._of
+        size, pair = self.size, np.repeat(np.arange(i.size), np.diff(self.above.indptr[:: self.size]))
+        row, column = np.divmod(self._where, size)
+        shares = np.where(i == j, 0.5, 1.0)[pair]  # of what its transpose brings again
+        places = (row + i[pair] * size, column + j[pair] * size)
+        half = sp.csr_array((shares * self.above.data, places), shape=(self.elements * size, self.elements * size))
+        return sp.csr_array(half + half.T)
+
     @property
     def size(self) -> int:
         """K."""

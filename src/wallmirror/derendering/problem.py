@@ -282,13 +282,18 @@ def _signal_space(problem: Problem, *, weak_patterns: bool) -> SignalSpace:
             grids.append(grids[-1].halved())
         span = Span.of(problem.weighted_data, problem.weighted(design_matrices(kernel, grids[-1])))
         # Where patterns drown in the films, the finest BRDF grid in whose span they stand out is taken.
+        best = None
         for grid in reversed(grids):
             if grid is not grids[-1]:
                 span = span.coarser(grid.in_halved())
-            within = span.space(elements, noise=1.0 if problem.noise_is_stated else None)
+            within = span.projected(elements, noise=1.0 if problem.noise_is_stated else None)
+            if within.rank > (space if best is None else best).rank:
+                best = within
             if within.rank == elements:
-                return within
-            space = within if within.rank > space.rank else space
+                break
+        space = space if best is None else best.space()
+        if space.rank == elements:
+            return space
     if certain or not weak_patterns:
         raise too_few_patterns(space.rank, elements)
     return space

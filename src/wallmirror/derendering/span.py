@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from wallmirror.derendering.moments import Pairs
 from wallmirror.derendering.subspace import SignalSpace, noise_edge
-from wallmirror.memory import require_memory, span_bytes
+from wallmirror.derendering.windows import Windows
+from wallmirror.memory import pairs_bytes, require_memory, span_bytes
 
 Array = NDArray[np.float64]
 
 # Columns among which the factorisation pivots, at least.
 _TOGETHER = 256
-# Columns of which the others that they meet are counted beforehand.
-_SAMPLED = 256
 # A column of which less than this share of the largest one's square is left beside those before it spans nothing new.
 _NEW = 1e-10
 # The span's weakest directions are known to the root of that, no better.
@@ -64,14 +64,16 @@ class Span:
     @classmethod
     def of(cls, data: Array, designs: list[sp.csr_array]) -> Span:
         """From D (P, B) and T_1 .. T_M (P, K), rows weighted so that the noise of all is alike; InputError where too large."""
+        windows = Windows.of(designs)
+        if windows is not None:
+            most = windows.most_entries()
+            require_memory(
+                pairs_bytes(most, 1) + span_bytes(2 * most),
+                f"the span of {len(designs)} elements on {designs[0].shape[1]} knots",
+            )
+        gram = Pairs.of(designs, windows, np.ones(data.shape[0])).whole()
         columns = sp.csc_array(sp.hstack(designs))
-        size = columns.shape[1]
-        # A sample of columns tells to some per cent how many entries the Gram matrix will have.
-        sample = np.random.default_rng(0).choice(size, min(size, _SAMPLED), replace=False)
-        entries = 1.25 * size / sample.size * (columns.T @ columns[:, sample]).nnz
-        require_memory(span_bytes(entries), f"the span of {len(designs)} elements on {designs[0].shape[1]} knots")
-        gram = sp.csr_array(columns.T @ columns)
-        itself = sp.eye_array(size, format="csr")
+        itself = sp.eye_array(columns.shape[1], format="csr")
         return cls(columns, itself, gram, columns.T @ data, float(np.sum(data * data)), len(designs))
 
     def coarser(self, halved: sp.csr_array) -> Span:
@@ -80,8 +82,8 @@ class Span:
         gram = sp.csr_array(every.T @ self.gram @ every)
         return Span(self.columns, self.prolongation @ every, gram, every.T @ self.right, self.energy, self.elements)
 
-    def space(self, elements: int, *, noise: float | None) -> SignalSpace:
-        """U of the projection.
+    def projected(self, elements: int, *, noise: float | None) -> Projected:
+        """The films' projection.
 
         Parameters
         ----------
@@ -99,13 +101,37 @@ class Span:
             noise = math.sqrt(rest / max(1, (rows - dimensions) * self.right.shape[1]))
         floor = noise * noise_edge(dimensions, self.right.shape[1])
         rank = int(np.count_nonzero(singular[:elements] > max(_ROUNDING * singular[0], floor)))
-        within = self.columns @ (self.prolongation @ basis.combined(left[:, :elements]))
-        return SignalSpace(within, singular, rank, dimensions)
+        return Projected(self, basis, left[:, :elements], singular, rank, dimensions)
 
 
 def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noise: float | None) -> SignalSpace:
     """U from the data's projection onto what any BRDF on the designs' grid could make of any pattern; see `Span`."""
-    return Span.of(data, designs).space(elements, noise=noise)
+    return Span.of(data, designs).projected(elements, noise=noise).space()
+
+
+@dataclass(frozen=True)
+class Projected:
+    """The films' projection onto a span, in coordinates of its basis Q.
+
+    Parameters
+    ----------
+    left:
+        Q^T U, shape (dimensions, M).
+    singular_values, rank, dimensions:
+        As those of a `SignalSpace`.
+    """
+
+    span: Span
+    basis: _Basis
+    left: Array
+    singular_values: Array
+    rank: int
+    dimensions: int
+
+    def space(self) -> SignalSpace:
+        """U itself, which takes a pass over the pixels."""
+        basis = self.span.columns @ (self.span.prolongation @ self.basis.combined(self.left))
+        return SignalSpace(basis, self.singular_values, self.rank, self.dimensions)
 
 
 @dataclass(frozen=True)
