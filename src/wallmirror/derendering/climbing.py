@@ -26,8 +26,9 @@ Tell = Callable[[str], None]
 # Share of a tolerance below which a move of the pattern is none.
 _SETTLED = 0.25
 # So many times more than noise explains must coarser knots lose by a quadratic guess for no fit to be tried on them: of a
-# change of the films that is no small share of their power, and of a smaller one, for which the guess is good.
-_HOPELESS, _POOR = 20.0, 2.0
+# change of the films that is no small share of their power, and of a smaller one, for which the guess is good: of 1500 such
+# losses of random scenes none was guessed by more than 8 % too high, nor by more than 3 % near what noise explains.
+_HOPELESS, _POOR = 20.0, 1.1
 _SMALL = 1e-4
 # Share of the BRDF's largest coefficient above which one is lit, of the best-seen one's information above which that one
 # counts, and of lit coefficients up to which rho is sparse.
