@@ -42,24 +42,21 @@ class Span:
 
     Parameters
     ----------
-    columns:
-        S of the finest knots, sparse (P, n).
+    designs:
+        T_1 .. T_M of the finest knots, each sparse (P, K), n = M K columns in all.
     prolongation:
         R, sparse (n, n'), where coarser knots have taken their place: theirs are S R.
     gram, right:
         (S R)^T S R, sparse (n', n'), and (S R)^T D, shape (n', B).
     energy:
         sum D^2.
-    elements:
-        M.
     """
 
-    columns: sp.csc_array
+    designs: list[sp.csr_array]
     prolongation: sp.csr_array
     gram: sp.csr_array
     right: Array
     energy: float
-    elements: int
 
     @classmethod
     def of(cls, data: Array, designs: list[sp.csr_array]) -> Span:
@@ -72,15 +69,20 @@ class Span:
                 f"the span of {len(designs)} elements on {designs[0].shape[1]} knots",
             )
         gram = Pairs.of(designs, windows, np.ones(data.shape[0])).whole()
-        columns = sp.csc_array(sp.hstack(designs))
-        itself = sp.eye_array(columns.shape[1], format="csr")
-        return cls(columns, itself, gram, columns.T @ data, float(np.sum(data * data)), len(designs))
+        itself = sp.eye_array(gram.shape[0], format="csr")
+        right = np.concatenate([t.T @ data for t in designs])
+        return cls(designs, itself, gram, right, float(np.sum(data * data)))
 
     def coarser(self, halved: sp.csr_array) -> Span:
         """That of knots twice as far apart, whose r is `halved` r on these knots, (K, K'); see `SplineGrid.in_halved`."""
-        every = sp.block_diag([halved] * self.elements, format="csr")
+        every = sp.block_diag([halved] * len(self.designs), format="csr")
         gram = sp.csr_array(every.T @ self.gram @ every)
-        return Span(self.columns, self.prolongation @ every, gram, every.T @ self.right, self.energy, self.elements)
+        return Span(self.designs, self.prolongation @ every, gram, every.T @ self.right, self.energy)
+
+    def films(self, coefficients: Array) -> Array:
+        """S R x for x of shape (n', m), (P, m)."""
+        parts = np.split(self.prolongation @ coefficients, len(self.designs))
+        return np.asarray(sum(t @ part for t, part in zip(self.designs, parts, strict=True)), dtype=np.float64)
 
     def projected(self, elements: int, *, noise: float | None) -> Projected:
         """The films' projection.
@@ -95,7 +97,7 @@ class Span:
         basis = _Basis.of(self.gram)
         projected = basis.projected(self.right)
         left, singular, _ = np.linalg.svd(projected, full_matrices=False)
-        rows, dimensions = self.columns.shape[0], projected.shape[0]
+        rows, dimensions = self.designs[0].shape[0], projected.shape[0]
         if noise is None:
             rest = max(0.0, self.energy - float(np.sum(projected * projected)))
             noise = math.sqrt(rest / max(1, (rows - dimensions) * self.right.shape[1]))
@@ -130,7 +132,7 @@ class Projected:
 
     def space(self) -> SignalSpace:
         """U itself, which takes a pass over the pixels."""
-        basis = self.span.columns @ (self.span.prolongation @ self.basis.combined(self.left))
+        basis = self.span.films(self.basis.combined(self.left))
         return SignalSpace(basis, self.singular_values, self.rank, self.dimensions)
 
 
