@@ -9,6 +9,7 @@ so that an iteration of a fit does not touch the pixels.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -182,11 +183,9 @@ class Moments:
 
     def gram_of_source(self, v: Array) -> Array:
         """sum_b J_b^T W J_b, dense (K, K), for v of shape (B, M)."""
-        total = np.zeros((self.size, self.size))
-        for g, pairs in enumerate(self.pairs):
-            rows = v[self.group == g]
-            total += pairs.mixed(rows.T @ rows)
-        return total
+        patterns = (v[self.group == g] for g in range(len(self.pairs)))
+        grams = (pairs.mixed(rows.T @ rows) for pairs, rows in zip(self.pairs, patterns, strict=True))
+        return functools.reduce(np.add, grams)
 
 
 def moments(data: Array, designs: list[sp.csr_array], inverse_variance: Array | None = None) -> Moments:
