@@ -176,7 +176,7 @@ def test_a_span_takes_what_is_foretold_or_is_refused(elements: int, monkeypatch:
     films_and_designs = 3 * data.nbytes + 5 * sum(t.data.nbytes for t in designs)
     assert used <= max(needed) + films_and_designs
     # What the first guard foretells, before there is a Gram matrix, is what refuses; a factor of two, see above, and the
-    # share of entries that a sample may miss.
+    # share of entries that a bound on them counts too many.
     assert max(needed) <= 1.25 * ROOM * used
     too_large(monkeypatch, f"{needed[0] / 2e9:g}")
     assert f"the span of {elements} elements" in str(refused(lambda: space_within(data, designs, elements, noise=1.0)))

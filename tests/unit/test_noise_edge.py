@@ -154,14 +154,14 @@ def test_coarser_knots_follow_from_finer_ones() -> None:
     data, halved = noisy(0.2, 0), coarse.in_halved()
     direct = space_within(data, design_matrices(kernel, coarse), ELEMENTS, noise=0.2)
     fine = Span.of(data, design_matrices(kernel, coarse.halved()))
-    inherited = fine.coarser(halved).space(ELEMENTS, noise=0.2)
+    inherited = fine.coarser(halved).projected(ELEMENTS, noise=0.2).space()
     assert (inherited.rank, inherited.dimensions) == (direct.rank, direct.dimensions)
     # Both know the span's weakest directions to 2e-16 / 1e-10.
     np.testing.assert_allclose(inherited.singular_values, direct.singular_values, rtol=1e-5)
     assert np.max(sl.subspace_angles(inherited.basis, direct.basis)) < 1e-4
-    assert fine.space(ELEMENTS, noise=0.2).dimensions > direct.dimensions
+    assert fine.projected(ELEMENTS, noise=0.2).dimensions > direct.dimensions
     # The planted fault: coefficients of coarser knots that are put one knot aside.
-    shifted = fine.coarser(sp.csr_array(np.roll(halved.toarray(), 1, axis=0))).space(ELEMENTS, noise=0.2)
+    shifted = fine.coarser(sp.csr_array(np.roll(halved.toarray(), 1, axis=0))).projected(ELEMENTS, noise=0.2)
     assert np.max(np.abs(shifted.singular_values / direct.singular_values - 1)) > 1e-3
 
 

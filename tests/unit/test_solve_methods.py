@@ -23,7 +23,7 @@ from wallmirror.derendering.problem import prepare
 from wallmirror.derendering.solution import Solution
 from wallmirror.derendering.solve import solve
 from wallmirror.geometry import Card, Observer
-from wallmirror.transport import Weights, radiance, transport_matrix
+from wallmirror.transport import Weights, build_kernel, radiance, transport_matrix
 
 from .helpers import EPS, assert_undetermined, far_apart, lobes, refused, thesis_card, thesis_observer, up_to_scale
 
@@ -52,6 +52,25 @@ def film(
         films = films + sigma * np.random.default_rng(seed).standard_normal(films.shape)
         variance = np.full(films.shape, sigma**2)
     return CaptureSet(observer=observer, card=card, transport=weights, radiance=films, variance=variance)
+
+
+@pytest.mark.parametrize(("weights", "width", "shared"), [("cosine", 0.0, True), ("physical", 0.4, False)])
+def test_a_kernel_serves_other_knots_only_where_their_quadrature_is_the_same(
+    weights: Weights, width: float, shared: bool
+) -> None:
+    observer = thesis_observer(40, 3, pixels_at="centres")
+    card = thesis_card(width=width)
+    problem, _ = prepare(film(observer, card, lobes(sigma_deg=6), patterns(4, 6), weights))
+    coarse, fine = problem.kernel(4.0, 1e-5), problem.kernel(0.5, 1e-5)
+    assert (coarse is fine) is shared
+    for step_deg, kernel in ((4.0, coarse), (0.5, fine)):
+        alone = build_kernel(observer, card, weights=weights, resolution=2 * math.radians(step_deg), tolerance=1e-5)
+        np.testing.assert_array_equal(kernel.weight, alone.weight)
+        np.testing.assert_array_equal(kernel.angle_sum, alone.angle_sum)
+    # Facets weigh a kernel of their own.
+    faceted = dataclasses.replace(problem, exponents={"incidence": -1.0}).kernel(4.0, 1e-5)
+    assert np.max(np.abs(faceted.weight - coarse.weight)) > 1e-3 * np.max(coarse.weight)
+    np.testing.assert_array_equal(problem.kernel(4.0, 1e-5).weight, coarse.weight)
 
 
 # -- fewer captures than elements ------------------------------------------------------------------------------

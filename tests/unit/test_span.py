@@ -19,7 +19,7 @@ def stretched(span: Span, basis: _Basis) -> NDArray[np.float64]:
     """|Q x| / |x| of the basis Q for some x."""
     dimensions = sum(kept.size for kept, *_ in basis.pieces)
     x = np.random.default_rng(0).standard_normal((dimensions, 4))
-    made = span.columns @ (span.prolongation @ basis.combined(x))
+    made = span.films(basis.combined(x))
     return np.asarray(np.linalg.norm(made, axis=0) / np.linalg.norm(x, axis=0))
 
 
@@ -30,7 +30,7 @@ def test_a_hundred_elements_span_all_films_of_few_pixels() -> None:
     span = Span.of(np.ones((PIXELS * VIEWS, 1)), designs)
     basis = _Basis.of(span.gram)
     # As NumPy's singular values have it, at the root of the share of a square at which a column spans nothing new.
-    columns = span.columns.toarray()
+    columns = np.concatenate([t.toarray() for t in designs], axis=1)
     rank = np.linalg.matrix_rank(columns, tol=1e-5 * float(np.max(np.linalg.norm(columns, axis=0))))
     assert rank == PIXELS * VIEWS
     assert sum(kept.size for kept, *_ in basis.pieces) == rank

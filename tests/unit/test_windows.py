@@ -83,6 +83,9 @@ def test_rows_that_are_no_runs_are_summed_up_all_the_same() -> None:
     full = np.stack([t.toarray() for t in scattered])
     grams = np.einsum("ipk,p,jpl->ijkl", full, weight, full)
     np.testing.assert_allclose(pairs.times(r), grams @ r, rtol=0, atol=1e-13)  # sums of 40 products of order one
+    side_by_side = np.concatenate(full, axis=1)
+    whole = side_by_side.T @ (weight[:, None] * side_by_side)
+    np.testing.assert_allclose(pairs.whole().toarray(), whole, rtol=0, atol=1e-13)
     mixture = rng.standard_normal((3, 3))
     mixture = mixture + mixture.T
     np.testing.assert_allclose(pairs.mixed(mixture), np.einsum("ij,ijkl->kl", mixture, grams), rtol=0, atol=1e-13)

@@ -108,8 +108,9 @@ def check_angle_sum(problem: Problem, estimate: Estimate, factors: tuple[Factor,
     unexplained, turns = _derivatives(problem, estimate, factors, weights)
     full = np.broadcast_to(weights, problem.data.shape)
     missed = problem.data - estimate.transport @ estimate.source
-    gram = np.array([[np.sum(full * a * b) for b in unexplained] for a in unexplained])
-    by_row = np.array([np.sum(full * a * missed, axis=1) for a in unexplained])
+    weighted = [weights * a for a in unexplained]
+    gram = np.array([[np.sum(a * b) for b in unexplained] for a in weighted])
+    by_row = np.array([np.sum(a * missed, axis=1) for a in weighted])
     used = full > 0
     observations, rows = int(np.count_nonzero(used)), int(np.count_nonzero(np.any(used, axis=1)))
     freedom = max(1, observations - int(np.count_nonzero(estimate.coefficients)) - estimate.source.size)

@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 
 # Share of a bound on V that a ten times larger ridge must leave.
 _KEPT = 0.8
+# Rows and columns of a block that stays in a processor's cache.
+_BLOCK = 64
 # The largest entry of a pattern must lie between these.
 _LEAST, _MOST = 1e-50, 1e50
 
@@ -138,8 +140,9 @@ def bound_of(
     def factor(ridge: float) -> Array:
         raised = pinned.copy()
         raised[np.diag_indices_from(raised)] += ridge
-        # What lies above the diagonal is left as it may be: to clear it takes longer than to factorise.
-        return np.asarray(sl.cho_factor(raised, lower=True, overwrite_a=True, check_finite=False)[0])
+        # What lies above the diagonal is left as it may be: to clear it takes longer than to factorise, and so does a copy in
+        # LAPACK's order, which the transpose has already.
+        return np.asarray(sl.cho_factor(raised.T, lower=True, overwrite_a=True, check_finite=False)[0])
 
     lower, sound = None, informed and lost <= 1e-3
     while lower is None:
@@ -175,8 +178,13 @@ def _inverse(lower: Array) -> Array:
     half, failed = lapack.dpotri(lower, lower=True)
     if failed:
         raise np.linalg.LinAlgError("the information is singular")
-    half = np.tril(half)
-    return np.asarray(half + np.tril(half, -1).T, dtype=np.float64)
+    size = half.shape[0]
+    for begin in range(0, size, _BLOCK):  # a transpose of the whole would go through the memory line by line
+        end = min(begin + _BLOCK, size)
+        half[begin:end, end:] = half[end:, begin:end].T
+        square = half[begin:end, begin:end]
+        half[begin:end, begin:end] = np.tril(square) + np.tril(square, -1).T
+    return np.asarray(half, dtype=np.float64)
 
 
 def _only(source: Array, elements: tuple[int, ...]) -> Array:

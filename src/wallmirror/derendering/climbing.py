@@ -26,8 +26,9 @@ Tell = Callable[[str], None]
 # Share of a tolerance below which a move of the pattern is none.
 _SETTLED = 0.25
 # So many times more than noise explains must coarser knots lose by a quadratic guess for no fit to be tried on them: of a
-# change of the films that is no small share of their power, and of a smaller one, for which the guess is good.
-_HOPELESS, _POOR = 20.0, 2.0
+# change of the films that is no small share of their power, and of a smaller one, for which the guess is good: of 1500 such
+# losses of random scenes none was guessed by more than 8 % too high, nor by more than 3 % near what noise explains.
+_HOPELESS, _POOR = 20.0, 1.1
 _SMALL = 1e-4
 # Share of the BRDF's largest coefficient above which one is lit, of the best-seen one's information above which that one
 # counts, and of lit coefficients up to which rho is sparse.
@@ -59,9 +60,9 @@ def climb(
     best = fit(index, ladder.closed(index).coefficients)
     rival: Other | None = None
     finer_fits: dict[int, Fit] = {}
-    while index > 0 and not _needed(ladder, index, best, tell):  # coarser ones may do
+    while index > 0 and (foretold := _coarser(ladder, index, best, tell)) is not None:
         finer_fits[index] = best
-        coarser = fit(index - 1, ladder.coarsened(index, best.coefficients))
+        coarser = fit(index - 1, foretold, ladder.coarsened(index, best.coefficients))
         if coarser.objective - best.objective > _HOPELESS * ladder.price(index - 1, index, best):
             # So much was not foretold: what is nearest where the captures look led to another maximum.
             again = fit(index - 1, ladder.closed(index - 1).coefficients)
@@ -105,20 +106,20 @@ def climb(
     return fits, rival
 
 
-def _needed(ladder: Ladder, index: int, fit: Fit, tell: Tell) -> bool:
-    """Whether coarser knots than a fit's would miss so much more than noise does that no fit on them is called for."""
+def _coarser(ladder: Ladder, index: int, fit: Fit, tell: Tell) -> Array | None:
+    """The next coarser knots' r that is foretold to be their best; None if it misses so much that no fit is called for."""
     summed = ladder.summed(index)
     halved = sp.csr_array(ladder.grids[index - 1].in_halved()[summed.seen])
-    schur = information(summed, fit.coefficients, fit.source, fit.schur).schur
+    schur = information(summed, fit.coefficients, fit.source).schur if fit.schur is None else fit.schur
     pull = np.einsum("ib,bik->k", fit.source, summed.cross)[summed.seen]
-    lost = loss(schur, fit.coefficients[summed.seen], pull, halved)
+    lost, nearest = loss(schur, fit.coefficients[summed.seen], pull, halved)
     freedom = ladder.freedom(index)
     saved = max(1, halved.shape[0] - int(np.count_nonzero(halved.sum(axis=0))))
     many = _POOR if lost < _SMALL * float(np.sum(summed.energy)) else _HOPELESS
     if lost < many * worth(saved, freedom) * ladder.variance(fit.objective, freedom):
-        return False
+        return nearest
     tell(f"knots every {math.degrees(ladder.grids[index - 1].step):g} deg would raise it by about {lost:.4g}")
-    return True
+    return None
 
 
 def _at_the_noise(ladder: Ladder, index: int, fit: Fit) -> bool:

@@ -45,7 +45,8 @@ def minimise_above(floor: Array, quadratic: Array, linear: Array) -> Array:
         x = np.zeros_like(floor)
         inside = np.flatnonzero(free)
         if inside.size:
-            x[inside] = solve_positive(quadratic[np.ix_(inside, inside)], offset[inside])
+            # Whole rows first: to pick entry by entry takes as long as to factorise.
+            x[inside] = solve_positive(quadratic[inside][:, inside], offset[inside])
         wrong = np.where(free, x < -1e-12 * np.max(np.abs(x)), quadratic @ x - offset < -slack)
         count = int(np.count_nonzero(wrong))
         if count < fewest:
@@ -87,7 +88,8 @@ def positive_factor(matrix: Array) -> Array:
     for ridge in (0.0, 1e-11, 1e-9, 1e-7):
         try:
             raised = matrix + ridge * np.mean(np.diag(matrix)) * np.eye(matrix.shape[0]) if ridge else matrix
-            return np.asarray(sl.cho_factor(raised, lower=True, check_finite=False)[0], dtype=np.float64)
+            # LAPACK goes by columns, as the transpose of NumPy's matrices does.
+            return np.asarray(sl.cho_factor(raised.T, lower=True, check_finite=False)[0], dtype=np.float64)
         except np.linalg.LinAlgError:
             continue
     raise UndeterminedError("the captures leave the pattern undetermined; capture more light, views or patterns")

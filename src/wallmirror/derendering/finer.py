@@ -177,8 +177,8 @@ def score(
     return Finer(gain, x, int(np.count_nonzero(moving)))
 
 
-def loss(schur: Array, r: Array, pull: Array, prolongation: sp.csr_array) -> float:
-    """The rise of the misfit that coarser knots make, as far as it is quadratic and not all of the films.
+def loss(schur: Array, r: Array, pull: Array, prolongation: sp.csr_array) -> tuple[float, Array]:
+    """The rise of the misfit that coarser knots make, as far as it is quadratic and not all of the films, and their r'.
 
     Parameters
     ----------
@@ -192,8 +192,9 @@ def loss(schur: Array, r: Array, pull: Array, prolongation: sp.csr_array) -> flo
     half = prolongation.T @ pinned
     coarse = half @ prolongation
     coarse[np.diag_indices_from(coarse)] += _RIDGE * np.trace(coarse) / coarse.shape[0]
-    missed = r - prolongation @ solve_positive(coarse, half @ r)
-    return float(missed @ pinned @ missed)
+    nearest = solve_positive(coarse, half @ r)
+    missed = r - prolongation @ nearest
+    return float(missed @ pinned @ missed), nearest
 
 
 def worth(added: int, freedom: int) -> float:

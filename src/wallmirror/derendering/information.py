@@ -155,7 +155,8 @@ def schur_complement(
     if bound.size:
         coupling = _coupling(data, point)[bound][..., kept]
         schur -= coupling.reshape(-1, cells.size).T @ (inverse[bound] @ coupling).reshape(-1, cells.size)
-    return 0.5 * (schur + schur.T)
+        schur = 0.5 * (schur + schur.T)
+    return schur
 
 
 def _coupling(data: Moments, point: Point) -> Array:

@@ -20,7 +20,7 @@ from wallmirror.derendering.finer import worth
 from wallmirror.derendering.groups import Groups
 from wallmirror.derendering.information import Information, information
 from wallmirror.derendering.ladder import SPARE, Ladder
-from wallmirror.derendering.likelihood import Fit, maximise
+from wallmirror.derendering.likelihood import Fit, finished
 from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.problem import Problem, expected_mismatch, too_few_patterns
 from wallmirror.derendering.splines import SplineGrid
@@ -162,7 +162,7 @@ def refine(
 def _level(ladder: Ladder, index: int, free: Fit, nonnegative: bool) -> Level | None:
     """The fit within the bounds asked for, or None where its error bars say that nothing determines it."""
     summed = ladder.summed(index)
-    fit = ladder.bounded(index, free) if nonnegative else maximise(summed, free.coefficients, nonnegative=False)
+    fit = ladder.bounded(index, free) if nonnegative else finished(summed, free)
     grid, groups = ladder.grids[index], ladder.groups(index)
     if len(groups) > 1:
         fit = groups.scaled(fit, grid, summed.exposure)

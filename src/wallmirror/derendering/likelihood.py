@@ -14,6 +14,7 @@ Non-negativity turns each step into a convex quadratic programme, solved by bloc
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,13 +26,15 @@ from wallmirror.derendering.information import Point, inverses, mixed, point_at,
 from wallmirror.derendering.moments import Moments, moments
 from wallmirror.errors import UndeterminedError
 
-__all__ = ["Fit", "Moments", "best_nonnegative", "maximise", "moments"]
+__all__ = ["Fit", "Moments", "best_nonnegative", "finished", "maximise", "moments"]
 
 Array = NDArray[np.float64]
 
 # Cells seen less than this relative to the best-seen one are weak: noise rules them in a start.
 _WEAK = 1e-4
 _RIDGE = 1e-12
+# Share of the misfit by which a full step may still lower it.
+_TOLERANCE = 1e-7
 # S is made anew where a step with that of the point before promises more than this share of what the last one did, or so
 # little, as a share of what ends the climb, that the climb seems to be over.
 _QUICK = 0.1
@@ -58,6 +61,8 @@ class Fit:
         Whether the last step was below the tolerance.
     schur:
         S at the maximum, over the seen coefficients, where it is at hand.
+    promised:
+        By how much a full step would still lower the objective, where that is known.
     """
 
     coefficients: Array
@@ -66,6 +71,7 @@ class Fit:
     iterations: int
     converged: bool
     schur: Array | None = None
+    promised: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -97,7 +103,7 @@ def maximise(
     data: Moments,
     *starts: Array,
     nonnegative: bool = True,
-    tolerance: float = 1e-7,
+    tolerance: float = _TOLERANCE,
     max_iterations: int = 60,
 ) -> Fit:
     """Climb to the maximum of the likelihood from the best of some starts (the closed form's r, a coarser fit).
@@ -128,7 +134,7 @@ def maximise(
         last, between = curvature, (_SURE * enough, _QUICK * slope)
         dr, slope, curvature = _step(data, state, seen, last, between, nonnegative=nonnegative)
         if slope <= enough and curvature is not last:
-            return _fit(state, iteration, converged=True, curvature=curvature)
+            return _fit(state, iteration, converged=True, promised=slope, curvature=curvature)
         length = 1.0
         while True:
             trial = point_at(data, state.r + length * dr, nonnegative=nonnegative)
@@ -141,11 +147,18 @@ def maximise(
     return _fit(state, max_iterations, converged=False)
 
 
+def finished(data: Moments, fit: Fit) -> Fit:
+    """The maximum without bounds, to the full tolerance, where a fit came near it that a larger one sufficed."""
+    if fit.promised <= _TOLERANCE * fit.objective:
+        return fit
+    return maximise(data, fit.coefficients, nonnegative=False)
+
+
 def best_nonnegative(data: Moments, source: Array) -> Array:
     """The r >= 0 of largest likelihood for a given pattern V >= 0 of shape (M, B): a convex problem, shape (K,)."""
     v = np.maximum(source.T if source.sum() > 0 else -source.T, 0.0)
     cells = np.flatnonzero(data.seen)
-    gram = data.gram_of_source(v)[np.ix_(cells, cells)]
+    gram = data.gram_of_source(v)[cells][:, cells]
     gram[np.diag_indices_from(gram)] += _RIDGE * float(np.trace(gram)) / max(1, cells.size)
     r = np.zeros(data.size)
     r[cells] = minimise_above(np.zeros(cells.size), gram, np.einsum("bi,bik->k", v, data.cross)[cells])
@@ -158,10 +171,17 @@ def _clipped(data: Moments, r: Array) -> Array:
     return np.clip(r, 0.0, np.where(weak, np.max(r[~weak], initial=0.0), np.inf))
 
 
-def _fit(state: Point, iterations: int, *, converged: bool, curvature: _Curvature | None = None) -> Fit:
+def _fit(
+    state: Point,
+    iterations: int,
+    *,
+    converged: bool,
+    promised: float = math.inf,
+    curvature: _Curvature | None = None,
+) -> Fit:
     # With entries of V at their bounds the curvature counts these as known, which the information does not.
     schur = curvature.schur if curvature is not None and np.all(curvature.free) else None
-    return Fit(state.r, state.v.T.copy(), state.objective, iterations, converged, schur)
+    return Fit(state.r, state.v.T.copy(), state.objective, iterations, converged, schur, promised)
 
 
 def _step(

@@ -9,6 +9,7 @@ so that an iteration of a fit does not touch the pixels.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -58,6 +59,16 @@ class Pairs:
         """R^T N_ij R for R of shape (K, K')."""
         every = sp.csr_array(sp.kron(sp.eye_array(self.above.shape[0] // self.size), halved, format="csr"))
         return Pairs(sp.csr_array(every.T.tocsr() @ (self.above @ every)), self.elements)
+
+    def whole(self) -> sp.csr_array:
+        """[T_1 .. T_M]^T W [T_1 .. T_M], sparse (M K, M K)."""
+        i, j = self._of
+        size, pair = self.size, np.repeat(np.arange(i.size), np.diff(self.above.indptr[:: self.size]))
+        row, column = np.divmod(self._where, size)
+        shares = np.where(i == j, 0.5, 1.0)[pair]  # of what its transpose brings again
+        places = (row + i[pair] * size, column + j[pair] * size)
+        half = sp.csr_array((shares * self.above.data, places), shape=(self.elements * size, self.elements * size))
+        return sp.csr_array(half + half.T)
 
     @property
     def size(self) -> int:
@@ -172,11 +183,9 @@ class Moments:
 
     def gram_of_source(self, v: Array) -> Array:
         """sum_b J_b^T W J_b, dense (K, K), for v of shape (B, M)."""
-        total = np.zeros((self.size, self.size))
-        for g, pairs in enumerate(self.pairs):
-            rows = v[self.group == g]
-            total += pairs.mixed(rows.T @ rows)
-        return total
+        patterns = (v[self.group == g] for g in range(len(self.pairs)))
+        grams = (pairs.mixed(rows.T @ rows) for pairs, rows in zip(self.pairs, patterns, strict=True))
+        return functools.reduce(np.add, grams)
 
 
 def moments(data: Array, designs: list[sp.csr_array], inverse_variance: Array | None = None) -> Moments:

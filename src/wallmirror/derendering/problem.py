@@ -18,7 +18,7 @@ from wallmirror.derendering.subspace import ClosedForm, SignalSpace, noise_edge,
 from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card
 from wallmirror.memory import require_memory, solution_bytes
-from wallmirror.transport import Kernel, build_kernel
+from wallmirror.transport import Kernel, build_kernel, quadrature_orders
 
 Array = NDArray[np.float64]
 
@@ -63,6 +63,7 @@ class Problem:
     noise_is_stated: bool
     scale: float
     exponents: dict[Factor, float] = field(default_factory=dict)
+    _kernels: dict[tuple[int, int], Kernel] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def card(self) -> Card:
@@ -110,15 +111,15 @@ class Problem:
         return first if np.all(self.inverse_variance == first) else self.inverse_variance
 
     def kernel(self, step_deg: float, tolerance: float) -> Kernel:
-        """The transport's kernel with a quadrature to match one knot spacing."""
-        kernel = build_kernel(
-            self.captures.observer,
-            self.captures.card,
-            weights=self.captures.transport,
-            resolution=2 * math.radians(step_deg),
-            tolerance=tolerance,
+        """The transport's kernel with a quadrature to match one knot spacing; the last one is kept for others like it."""
+        observer, card, weights = self.captures.observer, self.captures.card, self.captures.transport
+        orders = quadrature_orders(
+            observer, card, weights=weights, resolution=2 * math.radians(step_deg), tolerance=tolerance
         )
-        return weighted(kernel, self.exponents)
+        if orders not in self._kernels:
+            self._kernels.clear()
+            self._kernels[orders] = build_kernel(observer, card, weights=weights, orders=orders)
+        return weighted(self._kernels[orders], self.exponents)
 
     def designs(self, step_deg: float, *, degree: int, tolerance: float) -> tuple[SplineGrid, list[sp.csr_array]]:
         """The spline grid of one knot spacing and the transport over it, with quadrature to match."""
@@ -281,13 +282,18 @@ def _signal_space(problem: Problem, *, weak_patterns: bool) -> SignalSpace:
             grids.append(grids[-1].halved())
         span = Span.of(problem.weighted_data, problem.weighted(design_matrices(kernel, grids[-1])))
         # Where patterns drown in the films, the finest BRDF grid in whose span they stand out is taken.
+        best = None
         for grid in reversed(grids):
             if grid is not grids[-1]:
                 span = span.coarser(grid.in_halved())
-            within = span.space(elements, noise=1.0 if problem.noise_is_stated else None)
+            within = span.projected(elements, noise=1.0 if problem.noise_is_stated else None)
+            if within.rank > (space if best is None else best).rank:
+                best = within
             if within.rank == elements:
-                return within
-            space = within if within.rank > space.rank else space
+                break
+        space = space if best is None else best.space()
+        if space.rank == elements:
+            return space
     if certain or not weak_patterns:
         raise too_few_patterns(space.rank, elements)
     return space

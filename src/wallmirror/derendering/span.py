@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from wallmirror.derendering.moments import Pairs
 from wallmirror.derendering.subspace import SignalSpace, noise_edge
-from wallmirror.memory import require_memory, span_bytes
+from wallmirror.derendering.windows import Windows
+from wallmirror.memory import pairs_bytes, require_memory, span_bytes
 
 Array = NDArray[np.float64]
 
 # Columns among which the factorisation pivots, at least.
 _TOGETHER = 256
-# Columns of which the others that they meet are counted beforehand.
-_SAMPLED = 256
 # A column of which less than this share of the largest one's square is left beside those before it spans nothing new.
 _NEW = 1e-10
 # The span's weakest directions are known to the root of that, no better.
@@ -42,46 +42,50 @@ class Span:
 
     Parameters
     ----------
-    columns:
-        S of the finest knots, sparse (P, n).
+    designs:
+        T_1 .. T_M of the finest knots, each sparse (P, K), n = M K columns in all.
     prolongation:
         R, sparse (n, n'), where coarser knots have taken their place: theirs are S R.
     gram, right:
         (S R)^T S R, sparse (n', n'), and (S R)^T D, shape (n', B).
     energy:
         sum D^2.
-    elements:
-        M.
     """
 
-    columns: sp.csc_array
+    designs: list[sp.csr_array]
     prolongation: sp.csr_array
     gram: sp.csr_array
     right: Array
     energy: float
-    elements: int
 
     @classmethod
     def of(cls, data: Array, designs: list[sp.csr_array]) -> Span:
         """From D (P, B) and T_1 .. T_M (P, K), rows weighted so that the noise of all is alike; InputError where too large."""
-        columns = sp.csc_array(sp.hstack(designs))
-        size = columns.shape[1]
-        # A sample of columns tells to some per cent how many entries the Gram matrix will have.
-        sample = np.random.default_rng(0).choice(size, min(size, _SAMPLED), replace=False)
-        entries = 1.25 * size / sample.size * (columns.T @ columns[:, sample]).nnz
-        require_memory(span_bytes(entries), f"the span of {len(designs)} elements on {designs[0].shape[1]} knots")
-        gram = sp.csr_array(columns.T @ columns)
-        itself = sp.eye_array(size, format="csr")
-        return cls(columns, itself, gram, columns.T @ data, float(np.sum(data * data)), len(designs))
+        windows = Windows.of(designs)
+        if windows is not None:
+            most = windows.most_entries()
+            require_memory(
+                pairs_bytes(most, 1) + span_bytes(2 * most),
+                f"the span of {len(designs)} elements on {designs[0].shape[1]} knots",
+            )
+        gram = Pairs.of(designs, windows, np.ones(data.shape[0])).whole()
+        itself = sp.eye_array(gram.shape[0], format="csr")
+        right = np.concatenate([t.T @ data for t in designs])
+        return cls(designs, itself, gram, right, float(np.sum(data * data)))
 
     def coarser(self, halved: sp.csr_array) -> Span:
         """That of knots twice as far apart, whose r is `halved` r on these knots, (K, K'); see `SplineGrid.in_halved`."""
-        every = sp.block_diag([halved] * self.elements, format="csr")
+        every = sp.block_diag([halved] * len(self.designs), format="csr")
         gram = sp.csr_array(every.T @ self.gram @ every)
-        return Span(self.columns, self.prolongation @ every, gram, every.T @ self.right, self.energy, self.elements)
+        return Span(self.designs, self.prolongation @ every, gram, every.T @ self.right, self.energy)
 
-    def space(self, elements: int, *, noise: float | None) -> SignalSpace:
-        """U of the projection.
+    def films(self, coefficients: Array) -> Array:
+        """S R x for x of shape (n', m), (P, m)."""
+        parts = np.split(self.prolongation @ coefficients, len(self.designs))
+        return np.asarray(sum(t @ part for t, part in zip(self.designs, parts, strict=True)), dtype=np.float64)
+
+    def projected(self, elements: int, *, noise: float | None) -> Projected:
+        """The films' projection.
 
         Parameters
         ----------
@@ -93,19 +97,43 @@ class Span:
         basis = _Basis.of(self.gram)
         projected = basis.projected(self.right)
         left, singular, _ = np.linalg.svd(projected, full_matrices=False)
-        rows, dimensions = self.columns.shape[0], projected.shape[0]
+        rows, dimensions = self.designs[0].shape[0], projected.shape[0]
         if noise is None:
             rest = max(0.0, self.energy - float(np.sum(projected * projected)))
             noise = math.sqrt(rest / max(1, (rows - dimensions) * self.right.shape[1]))
         floor = noise * noise_edge(dimensions, self.right.shape[1])
         rank = int(np.count_nonzero(singular[:elements] > max(_ROUNDING * singular[0], floor)))
-        within = self.columns @ (self.prolongation @ basis.combined(left[:, :elements]))
-        return SignalSpace(within, singular, rank, dimensions)
+        return Projected(self, basis, left[:, :elements], singular, rank, dimensions)
 
 
 def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noise: float | None) -> SignalSpace:
     """U from the data's projection onto what any BRDF on the designs' grid could make of any pattern; see `Span`."""
-    return Span.of(data, designs).space(elements, noise=noise)
+    return Span.of(data, designs).projected(elements, noise=noise).space()
+
+
+@dataclass(frozen=True)
+class Projected:
+    """The films' projection onto a span, in coordinates of its basis Q.
+
+    Parameters
+    ----------
+    left:
+        Q^T U, shape (dimensions, M).
+    singular_values, rank, dimensions:
+        As those of a `SignalSpace`.
+    """
+
+    span: Span
+    basis: _Basis
+    left: Array
+    singular_values: Array
+    rank: int
+    dimensions: int
+
+    def space(self) -> SignalSpace:
+        """U itself, which takes a pass over the pixels."""
+        basis = self.span.films(self.basis.combined(self.left))
+        return SignalSpace(basis, self.singular_values, self.rank, self.dimensions)
 
 
 @dataclass(frozen=True)

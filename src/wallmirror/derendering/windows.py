@@ -107,26 +107,36 @@ class Windows:
         count, height, elements, width = self.blocks.shape
         weights = self.cut(weight[:, None])
         ahead = np.arange(width)
+        # Room for every element's products: the system takes as long to clear it anew as these take to multiply.
+        left = np.empty((count, height, width))
+        products = np.empty(count * width * elements * width)
+        places = np.empty(products.size, dtype=np.intp)
         found = []
         for i in range(elements):
-            left = (weights * self.blocks[:, :, i]).transpose(0, 2, 1)
+            np.multiply(weights, self.blocks[:, :, i], out=left)
             right = self.blocks[:, :, i:].reshape(count, height, -1)
-            product = (left @ right).reshape(count, width, elements - i, width)
-            # Rows of N_ij reach from `low` on, over `reach` columns at most: that small table sums the blocks up.
+            entries = count * width * (elements - i) * width
+            product, place = products[:entries], places[:entries]
+            np.matmul(left.transpose(0, 2, 1), right, out=product.reshape(count, width, -1))
+            # Rows of N_ij reach from `low` up to `high`: one such stretch after the other, a small table sums the blocks up.
             row = (self.begin[:, i, None] + ahead)[:, :, None] + self.size * np.arange(elements - i)
             begin = np.broadcast_to(self.begin[:, None, i:], row.shape)
-            low = np.full(self.size * (elements - i), self.size)
+            low, high = (
+                np.full(self.size * (elements - i), self.size),
+                np.zeros(self.size * (elements - i), dtype=np.intp),
+            )
             np.minimum.at(low, row.ravel(), begin.ravel())
-            beyond = begin - low[row]
-            reach = int(np.max(beyond)) + width
-            place = (row * reach + beyond)[..., None] + ahead
-            table = np.bincount(place.ravel(), weights=product.ravel(), minlength=low.size * reach)
-            filled = table != 0
-            entries = np.count_nonzero(filled.reshape(-1, reach), axis=1)
-            column = np.flatnonzero(filled) + np.repeat(low - reach * np.arange(low.size), entries)
-            found.append((entries, column, table[filled]))
-        entries, columns, values = (np.concatenate(part) for part in zip(*found, strict=True))
-        return entries, columns, values
+            np.maximum.at(high, row.ravel(), begin.ravel() + width)
+            reach = np.maximum(high - low, 0)
+            end = np.cumsum(reach)
+            shift = end - reach - low
+            np.add((shift[row] + begin)[..., None], ahead, out=place.reshape(*row.shape, width))
+            table = np.bincount(place, weights=product, minlength=int(end[-1]))
+            filled = np.flatnonzero(table)
+            of_row = np.diff(np.searchsorted(filled, end), prepend=0)
+            found.append((of_row, filled - np.repeat(shift, of_row), table[filled]))
+        of_rows, columns, values = (np.concatenate(part) for part in zip(*found, strict=True))
+        return of_rows, columns, values
 
 
 def _cuts(runs: Indices) -> Indices:

@@ -81,7 +81,12 @@ def build_kernel(
 
 
 def quadrature_orders(
-    observer: Observer, card: Card, *, resolution: float = math.pi / 4, tolerance: float = 1e-6
+    observer: Observer,
+    card: Card,
+    *,
+    weights: Weights = "physical",
+    resolution: float = math.pi / 4,
+    tolerance: float = 1e-6,
 ) -> tuple[int, int]:
-    """Nodes across a pixel and across a strip that `build_kernel` takes for physical weights, with its parameters."""
-    return Nodes.of(observer, card, "physical").orders(resolution, tolerance)
+    """Nodes across a pixel and across a strip that `build_kernel` takes, with its parameters."""
+    return Nodes.of(observer, card, weights).orders(resolution, tolerance)
