@@ -94,33 +94,49 @@ def test_what_the_noise_in_the_wall_alone_tells_is_not_called_good(
 
 
 def test_what_noise_adds_is_foretold() -> None:
-    """Against the information at r with many noises of that covariance added: the square of J along one direction of V."""
+    """Against the average over noises in r of the square of J that a least-squares fit of r and V leaves, by full matrices."""
     observer, card, brdf = thesis_observer(60, 3), thesis_card(3), lobes(sigma_deg=8.0)
     captures, source = filmed(observer, card, brdf, 6, 15.0, weights="cosine")
     problem, _ = prepare(captures, weak_patterns=True)
     grid, designs = problem.designs(4.0, degree=3, tolerance=1e-7)
     summed = moments(problem.data, designs, problem.inverse_variance)
-    v = source / problem.scale
-    r = grid.interpolate(brdf.of_sum)
+    v, r = source / problem.scale, grid.interpolate(brdf.of_sum)
     known = information(summed, r, v)
     bound = cramer_rao(summed, r, v, gauge=grid.row(grid.peak(r, summed.exposure)))
-    share = borrowed_share(summed, known, bound, v, sigma=1.0, groups=one_group(designs))
-    # The worst direction anew, as the leading eigenvector of the covariance of V, freed of the scale, by the full matrix.
+    transport = np.stack([t @ r for t in designs], axis=1)
+    with pytest.MonkeyPatch.context() as whole:  # as where it matters
+        whole.setattr("wallmirror.derendering.borrowed._MATTERS", 0.0)
+        whole.setattr("wallmirror.derendering.borrowed._CARRYING", r.size)
+        share = borrowed_share(
+            problem, designs, summed, known, bound, transport, v, sigma=1.0, groups=one_group(designs)
+        )
+    # The worst direction as the leading eigenvector of the covariance of V, freed of the scale.
     spread = known.coupled.reshape(-1, bound.coefficients.shape[0])
     unit = v.T.ravel() / np.linalg.norm(v)
-    spread_free = spread - np.outer(unit, unit @ spread)
-    values, vectors = np.linalg.eigh(spread_free @ bound.coefficients @ spread_free.T)
-    dr = bound.coefficients @ (spread_free.T @ vectors[:, -1])
-    dv = (spread @ dr).reshape(6, 3)
-    own = float(np.sum((spread_free @ dr) ** 2)) / values[-1]
-    rng = np.random.default_rng(1)
-    noises = rng.multivariate_normal(np.zeros(dr.size), bound.coefficients, size=4000, method="eigh")
+    spread -= np.outer(unit, unit @ spread)
+    values, vectors = np.linalg.eigh(spread @ bound.coefficients @ spread.T)
+    dr = bound.coefficients @ (spread.T @ vectors[:, -1])
+    dv = (spread @ dr).reshape(v.shape[1], -1)
+    own = float(np.sum(dv**2)) / values[-1]
+    # All films that dr and dV make, weighted, one column each.
+    root = np.sqrt(np.broadcast_to(problem.fit_weights, problem.data.shape))
+    of_r = [
+        (root * (np.stack([t.toarray()[:, k] for t in designs], axis=1) @ v)).ravel()
+        for k in np.flatnonzero(bound.seen)
+    ]
+    of_v = [
+        (root * np.outer(transport[:, i], np.eye(v.shape[1])[b])).ravel() for i in range(3) for b in range(v.shape[1])
+    ]
+    made = np.linalg.qr(np.stack([*of_r, *of_v], axis=1))[0]
+    noises = np.random.default_rng(1).multivariate_normal(
+        np.zeros(dr.size), bound.coefficients, size=2000, method="eigh"
+    )
     added = []
     for noise in noises:
-        whole = np.zeros(r.size)
-        whole[bound.seen] = noise
-        films = np.stack([t @ whole for t in designs], axis=1) @ dv.T
-        weight = 1.0 if problem.inverse_variance is None else problem.inverse_variance
-        added.append(float(np.sum(weight * films**2)))
-    # The mean of 4,000 squares of few normal values is known to 5 %, and the power iteration to a few more.
+        coefficients = np.zeros(r.size)
+        coefficients[bound.seen] = noise
+        films = (root * (np.stack([t @ coefficients for t in designs], axis=1) @ dv.T)).ravel()
+        films -= made @ (made.T @ films)
+        added.append(float(films @ films))
+    # The mean of 2,000 squares of few normal values is known to 5 %, and the worst direction to a few more.
     assert np.mean(added) / own == pytest.approx(share, rel=0.1)

@@ -8,63 +8,116 @@ taken at the r that was found. Noise in that r, of covariance Cov(r), adds on av
 
     E |sum_i T_i (r' - r) dV_i|^2 = tr(Cov(r) sum_ij (dV dV^T)_ij T_i^T W T_j)
 
-to |F dV|^2, so that a direction of which the true r tells nothing at all (a wall that looks alike to all elements, an element
-that no lobe reaches) comes out with bars of some per cent, however little noise there is. Where such borrowed information is
-as much as the own, the Cramer-Rao bound at the fit is no bound.
+to |J|^2, less what other r and V make of that change of the films. So a direction of which the true r tells nothing at all (a
+wall that looks alike to all elements, an element that no lobe reaches) comes out with bars of some per cent, however little
+noise there is. Where such borrowed information is as much as the own, the Cramer-Rao bound at the fit is no bound.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from wallmirror.derendering.bounds import Bound
 from wallmirror.derendering.groups import Groups
 from wallmirror.derendering.information import Information
 from wallmirror.derendering.moments import Moments
+from wallmirror.derendering.problem import Problem
 
 Array = NDArray[np.float64]
 
 # Steps of the power iteration towards the worst-known direction: it need not be found well, for all bad ones borrow.
 _STEPS = 8
+# Directions of the noise in r of which what other r and V make is taken off, where it may matter: few carry nearly all.
+_CARRYING = 12
+_MATTERS = 0.25
 
 
 def borrowed_share(
-    summed: Moments, known: Information, bound: Bound, source: Array, *, sigma: float, groups: Groups
+    problem: Problem,
+    designs: list[sp.csr_array],
+    summed: Moments,
+    known: Information,
+    bound: Bound,
+    transport: Array,
+    source: Array,
+    *,
+    sigma: float,
+    groups: Groups,
 ) -> float:
     """What noise adds to the information along the worst-known direction of V, over all that is found there.
 
     Parameters
     ----------
-    summed, known, bound:
-        The moments of the films, the information at (r, V), and the bound that it gives.
-    source:
-        V, shape (M, B).
+    designs, summed:
+        T_1 .. T_M (P, K), and the moments of the films on them.
+    known, bound:
+        The information at (r, V), and the bound that it gives.
+    transport, source:
+        F (P, M) and V (M, B).
     sigma:
         Standard deviation of the noise in units of the weights.
     """
     elements, realisations = source.shape
-    coupled = known.coupled.reshape(realisations * elements, -1)
-    parts = np.zeros((len(groups), realisations, elements))
-    for part, mine in zip(parts, map(list, groups.elements), strict=True):
-        part[:, mine] = source[mine].T
-    scales = parts.reshape(len(groups), -1)
-    scales /= np.maximum(np.linalg.norm(scales, axis=1, keepdims=True), 1e-300)
-
-    def turn(dr: Array) -> Array:
-        """-dV of a change of r, freed of the scales."""
-        dv = coupled @ dr
-        return np.asarray(dv - scales.T @ (scales @ dv))
-
-    dr = np.random.default_rng(0).standard_normal(coupled.shape[1])
-    variance = 0.0
+    coupled, covariance = known.coupled.reshape(realisations * elements, -1), bound.coefficients
+    scales = _scales(source, groups)
+    dr, variance = np.random.default_rng(0).standard_normal(coupled.shape[1]), 0.0
     for _ in range(_STEPS):
         before = dr / max(float(np.linalg.norm(dr)), 1e-300)
-        dr = bound.coefficients @ (coupled.T @ turn(before))
+        dr = covariance @ (coupled.T @ _freed(coupled @ before, scales))
         variance = float(before @ dr)
-    if not variance > 0:
+    dv = _freed(coupled @ dr, scales)
+    if not (variance > 0 and np.any(dv)):
         return 0.0
-    dv = turn(dr)
     own = float(dv @ dv) / variance
-    beside = summed.gram_of_source((coupled @ dr).reshape(realisations, elements))[np.ix_(known.seen, known.seen)]
-    return float(sigma**2 * np.sum(beside * bound.coefficients) / own) if own > 0 else 0.0
+    dv = dv.reshape(realisations, elements)
+    beside = summed.gram_of_source(dv)[np.ix_(known.seen, known.seen)]
+    unit = sigma**2 / own
+    share = float(unit * np.sum(beside * covariance))
+    if share < _MATTERS:
+        return share
+    # Noise in r by direction, the one that adds most first; of the first few what other r and V make of it is taken off.
+    level, turned = np.linalg.eigh(covariance)
+    root = turned * np.sqrt(np.maximum(level, 0.0))
+    adds, mixed = np.linalg.eigh(root.T @ beside @ root)
+    noises = (root @ mixed[:, ::-1])[:, :_CARRYING].T
+    rest = float(np.sum(adds[: max(0, adds.size - _CARRYING)]))
+    return unit * (
+        rest + sum(_beyond(problem, designs, known, covariance, transport, source, noise, dv) for noise in noises)
+    )
+
+
+def _scales(source: Array, groups: Groups) -> Array:
+    """The directions of V in which a scale of a group moves it, of unit length, (G, B M)."""
+    parts = np.zeros((len(groups), *source.T.shape))
+    for part, mine in zip(parts, map(list, groups.elements), strict=True):
+        part[:, mine] = source[mine].T
+    flat = parts.reshape(len(groups), -1)
+    return np.asarray(flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300))
+
+
+def _freed(dv: Array, scales: Array) -> Array:
+    return np.asarray(dv - scales.T @ (scales @ dv))
+
+
+def _beyond(
+    problem: Problem,
+    designs: list[sp.csr_array],
+    known: Information,
+    covariance: Array,
+    transport: Array,
+    source: Array,
+    noise: Array,
+    dv: Array,
+) -> float:
+    """The square of sum_i T_i dr dV_i for a noise dr in r, in units of the weights, that no change of r and V makes."""
+    whole = np.zeros(known.seen.size)
+    whole[known.seen] = noise
+    films = np.stack([t @ whole for t in designs], axis=1) @ dv.T
+    weighted = problem.fit_weights * films
+    by_v = transport.T @ weighted  # F^T W b of each realisation
+    made = np.einsum("bij,jb->ib", known.inverse, by_v)
+    by_r = sum(t.T @ (weighted @ v) for t, v in zip(designs, source, strict=True))[known.seen]
+    by_r -= np.einsum("bik,ib->k", known.coupled, by_v)
+    return max(0.0, float(np.sum(weighted * films) - np.sum(by_v * made) - by_r @ covariance @ by_r))

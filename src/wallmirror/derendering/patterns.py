@@ -32,12 +32,12 @@ Array = NDArray[np.float64]
 # Standard deviation of a coefficient that the other elements leave it, as a share of the largest that a fit without bounds has,
 # from which it is free: beside a false pattern, which is faint, coefficients of its own grow large.
 _FREE = 0.3
-# Share of borrowed information from which on bars are a root of two too small; and bars below which none lies behind them, as
-# noise in the few hundred numbers that r has makes bars of per cents, whatever its strength.
-_HALF, _TELLING = 0.5, 3e-3
+# Shares of borrowed information: half makes bars a root of two too small, a third a fifth. And bars below which none lies
+# behind them, as noise in the few hundred numbers that r has makes bars of per cents, whatever its strength.
+_HALF, _THIRD, _TELLING = 0.5, 1 / 3, 3e-3
 _BORROWED = (
-    "half of what the captures seem to tell of the worst-known side of the pattern is the noise in the BRDF that was found, so "
-    "its error bars are too small; use views or a card whose reflections share more angles"
+    "a third or more of what the captures seem to tell of the worst-known side of the pattern is the noise in the BRDF that "
+    "was found, so its error bars are too small; use views or a card whose reflections share more angles"
 )
 _DOUBT = (
     "the faintest of the patterns is one that noise alone makes once in ten to a hundred times, so that one element fewer may "
@@ -80,14 +80,22 @@ def trusted_bound(
     if sigma * level.bound.source_error <= _TELLING:
         return trusted, doubts
     share = borrowed_share(
-        level.summed, level.information, level.bound, level.fit.source, sigma=sigma, groups=level.groups
+        problem,
+        level.designs,
+        level.summed,
+        level.information,
+        level.bound,
+        np.stack([t @ level.fit.coefficients for t in level.designs], axis=1),
+        level.fit.source,
+        sigma=sigma,
+        groups=level.groups,
     )
-    if share >= 1:
+    if share > _HALF:
         raise UndeterminedError(
             "what the captures seem to tell of the pattern is the noise in the BRDF that was found: of a wall without that "
             "noise they would not tell it; use views or a card whose reflections share more angles"
         )
-    return trusted, (*doubts, _BORROWED) if share > _HALF else doubts
+    return trusted, (*doubts, _BORROWED) if share > _THIRD else doubts
 
 
 def _of_certain_patterns(
