@@ -32,9 +32,9 @@ Array = NDArray[np.float64]
 # Standard deviation of a coefficient that the other elements leave it, as a share of the largest that a fit without bounds has,
 # from which it is free: beside a false pattern, which is faint, coefficients of its own grow large.
 _FREE = 0.3
-# Shares of borrowed information: half makes bars a root of two too small, a third a fifth. And bars below which none lies
-# behind them, as noise in the few hundred numbers that r has makes bars of per cents, whatever its strength.
-_HALF, _THIRD, _TELLING = 0.5, 1 / 3, 3e-3
+# A share of borrowed information of a third makes bars a fifth too small. And bars below which none lies behind them, as noise
+# in the few hundred numbers that r has makes bars of per cents, whatever its strength.
+_THIRD, _TELLING = 1 / 3, 3e-3
 _BORROWED = (
     "a third or more of what the captures seem to tell of the worst-known side of the pattern is the noise in the BRDF that "
     "was found, so its error bars are too small; use views or a card whose reflections share more angles"
@@ -90,7 +90,7 @@ def trusted_bound(
         sigma=sigma,
         groups=level.groups,
     )
-    if share > _HALF:
+    if share >= 1:
         raise UndeterminedError(
             "what the captures seem to tell of the pattern is the noise in the BRDF that was found: of a wall without that "
             "noise they would not tell it; use views or a card whose reflections share more angles"
