@@ -30,8 +30,8 @@ _SOLUTION_ARRAYS, _ELEMENT_ARRAYS, _SOLUTION_BYTES = 8.5, 24, 20e6
 # Squares of the smaller side of the films that their singular values take.
 _DECOMPOSED_SQUARES = 12
 # Bytes of an entry of the sparse Gram matrix of T_1 .. T_M while its band is ordered; and squares of the columns among which
-# its factorisation pivots (at least so many) with those that they reach.
-_GRAM_ENTRY, _PIVOTS, _WINDOW_SQUARES = 44, 256, 4
+# its factorisation pivots with those that they reach.
+_GRAM_ENTRY, _WINDOW_SQUARES = 44, 4
 # Bytes of an entry of T_i^T W T_j while it is made and for as long as it is held; a bound on the entries is 1.4 times them.
 _ENTRY_MADE, _ENTRY_HELD = 36, 19
 # Beside degree + 1 basis functions at all nodes: their sums and places, and one element's share with the weight.
@@ -115,9 +115,12 @@ def solution_bytes(views: int, pixels: int, elements: int, realisations: int) ->
     return float(_FLOAT) * (float(views) * pixels * per_pixel + decomposed) + _SOLUTION_BYTES
 
 
-def span_bytes(entries: float, columns: int = 0, reach: int = 0) -> float:
-    """Peak of a sparse Gram matrix of so many entries, and of the factor of a band that reaches so far from the diagonal."""
-    window = float(columns and max(reach, _PIVOTS) + reach)
+def span_bytes(entries: float, columns: int = 0, reach: int = 0, together: int = 0) -> float:
+    """Peak of a sparse Gram matrix of so many entries, and of the factor of its band.
+
+    The band reaches so far from the diagonal, and the factorisation pivots among so many columns together.
+    """
+    window = float(together + reach)
     return float(_GRAM_ENTRY) * entries + float(_FLOAT) * (_WINDOW_SQUARES * window**2 + float(columns) * reach)
 
 

@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from hypothesis import settings
 from numpy.typing import NDArray
 
 from wallmirror.brdf import AngleSumBRDF, GaussianTrain
+from wallmirror.derendering.span import Span
 from wallmirror.derendering.splines import SplineGrid
+from wallmirror.derendering.subspace import SignalSpace
 from wallmirror.errors import InputError, UndeterminedError, WallmirrorError
 from wallmirror.geometry import Card, Observer, PixelPlacement, scan_angles
 
@@ -92,3 +95,8 @@ def up_to_scale(estimate: Array, truth: Array) -> float:
 def far_apart() -> tuple[Observer, Card]:
     """Two elements 250 m apart at 50 m: their angle sums have no value in common, so each has a scale of its own."""
     return thesis_observer(), Card(elements_x=(-125.0, 125.0), y=-50.0)
+
+
+def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noise: float | None) -> SignalSpace:
+    """U from the films' projection onto the span of their designs, see `Span`."""
+    return Span.of(data, designs).projected(elements, noise=noise).space()

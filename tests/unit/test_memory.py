@@ -15,13 +15,12 @@ from wallmirror.captures import CaptureSet
 from wallmirror.derendering import problem, splines
 from wallmirror.derendering.problem import prepare
 from wallmirror.derendering.solve import solve
-from wallmirror.derendering.span import space_within
 from wallmirror.geometry import Card, Observer
 from wallmirror.pathtracing.filming import render_captures, render_one_hot
 from wallmirror.scene import load_scene
 from wallmirror.transport import build_kernel, radiance, transport_matrix
 
-from .helpers import lobes, refused, thesis_card, thesis_observer
+from .helpers import lobes, refused, space_within, thesis_card, thesis_observer
 
 LOBES = lobes()
 WIDE = thesis_observer(2000, 10, "centres")

@@ -13,12 +13,12 @@ import scipy.stats
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from wallmirror.derendering.span import Span, space_within
+from wallmirror.derendering.span import Span
 from wallmirror.derendering.splines import design_matrices, grid_for
 from wallmirror.derendering.subspace import noise_edge, signal_space
 from wallmirror.transport import build_kernel
 
-from .helpers import lobes, thesis_card, thesis_observer
+from .helpers import lobes, space_within, thesis_card, thesis_observer
 
 Array = NDArray[np.float64]
 

@@ -61,7 +61,8 @@ def borrowed_share(
     """
     elements, realisations = source.shape
     coupled, covariance = known.coupled.reshape(realisations * elements, -1), bound.coefficients
-    scales = _scales(source, groups)
+    scales = groups.patterns(source).reshape(len(groups), -1)
+    scales /= np.maximum(np.linalg.norm(scales, axis=1, keepdims=True), 1e-300)
     dr, variance = np.random.default_rng(0).standard_normal(coupled.shape[1]), 0.0
     for _ in range(_STEPS):
         before = dr / max(float(np.linalg.norm(dr)), 1e-300)
@@ -88,16 +89,8 @@ def borrowed_share(
     )
 
 
-def _scales(source: Array, groups: Groups) -> Array:
-    """The directions of V in which a scale of a group moves it, of unit length, (G, B M)."""
-    parts = np.zeros((len(groups), *source.T.shape))
-    for part, mine in zip(parts, map(list, groups.elements), strict=True):
-        part[:, mine] = source[mine].T
-    flat = parts.reshape(len(groups), -1)
-    return np.asarray(flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300))
-
-
 def _freed(dv: Array, scales: Array) -> Array:
+    """dV (B M,) without its parts along the scales, (G, B M) of unit length."""
     return np.asarray(dv - scales.T @ (scales @ dv))
 
 

@@ -123,7 +123,7 @@ def bound_of(
     c, r = np.atleast_2d(gauge)[:, seen], coefficients[seen]
     # A null direction of S for each scale that is free: the group's part of r.
     null = r[None] if groups is None else np.where(groups.cells[:, seen], r, 0.0)
-    patterns = source.T[None] if groups is None else np.stack([_only(source, each).T for each in groups.elements])
+    patterns = source.T[None] if groups is None else groups.patterns(source)
     # Where rounding is all there is, the trace may be negative.
     level = float(np.trace(schur)) / max(1, schur.shape[0])
     informed, level = level > 0, level if level > 0 else float(np.max(np.abs(schur), initial=0.0)) or 1.0
@@ -185,12 +185,6 @@ def _inverse(lower: Array) -> Array:
         square = half[begin:end, begin:end]
         half[begin:end, begin:end] = np.tril(square) + np.tril(square, -1).T
     return np.asarray(half, dtype=np.float64)
-
-
-def _only(source: Array, elements: tuple[int, ...]) -> Array:
-    part = np.zeros_like(source)
-    part[list(elements)] = source[list(elements)]
-    return part
 
 
 def _shape_std(patterns: Array, inverse: Array, coupled: Array, spread: Array, variance: Array) -> Array:

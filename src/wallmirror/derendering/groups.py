@@ -39,6 +39,13 @@ class Groups:
     def __len__(self) -> int:
         return len(self.elements)
 
+    def patterns(self, source: Array) -> Array:
+        """V (M, B) of each group alone, (G, B, M): the directions in which a scale of the group moves it."""
+        parts = np.zeros((len(self), *source.T.shape))
+        for part, mine in zip(parts, map(list, self.elements), strict=True):
+            part[:, mine] = source[mine].T
+        return parts
+
     def gauges(self, grid: SplineGrid, coefficients: Array, exposure: Array) -> Array:
         """c of each group, (G, K): the basis functions where the well-seen part of its rho is largest."""
         places = []

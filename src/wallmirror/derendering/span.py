@@ -106,11 +106,6 @@ class Span:
         return Projected(self, basis, left[:, :elements], singular, rank, dimensions)
 
 
-def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noise: float | None) -> SignalSpace:
-    """U from the data's projection onto what any BRDF on the designs' grid could make of any pattern; see `Span`."""
-    return Span.of(data, designs).projected(elements, noise=noise).space()
-
-
 @dataclass(frozen=True)
 class Projected:
     """The films' projection onto a span, in coordinates of its basis Q.
@@ -154,12 +149,15 @@ class _Basis:
 
     @classmethod
     def of(cls, gram: sp.csr_array, together: int | None = None) -> _Basis:
+        """From S^T S, pivoting among so many columns; among as many as the band reaches, if left out."""
         order = np.asarray(reverse_cuthill_mckee(gram, symmetric_mode=True), dtype=np.intp)
         ordered = sp.csr_array(gram[order][:, order])
         row, column = ordered.tocoo().coords
         size, reach = order.size, int(np.max(row - column, initial=0))
         together = max(_TOGETHER, reach) if together is None else together
-        require_memory(span_bytes(ordered.nnz, size, reach), f"the span of {size} columns in a band of {reach}")
+        require_memory(
+            span_bytes(ordered.nnz, size, reach, together), f"the span of {size} columns in a band of {reach}"
+        )
         least = _NEW * float(np.max(ordered.diagonal(), initial=0.0))
         pieces = []
         left = np.zeros((0, 0))  # what is left of the Gram matrix between the columns from `start` on, up to the reach
