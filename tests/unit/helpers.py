@@ -13,6 +13,7 @@ from hypothesis import settings
 from numpy.typing import NDArray
 
 from wallmirror.brdf import AngleSumBRDF, GaussianTrain
+from wallmirror.derendering.moments import moments
 from wallmirror.derendering.span import Span
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import SignalSpace
@@ -99,4 +100,5 @@ def far_apart() -> tuple[Observer, Card]:
 
 def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noise: float | None) -> SignalSpace:
     """U from the films' projection onto the span of their designs, see `Span`."""
-    return Span.of(data, designs).projected(elements, noise=noise).space()
+    projected = Span.of(moments(data, designs), data.shape[0]).projected(elements, noise=noise)
+    return projected.space(designs, np.ones((data.shape[0], 1)))

@@ -20,7 +20,7 @@ from wallmirror.derendering.angle_sum_check import check_angle_sum, with_doubt
 from wallmirror.derendering.estimate import Estimate, scale_free_error
 from wallmirror.derendering.facet_fit import fit_facets
 from wallmirror.derendering.facets import EVERY, FITTED, weighted
-from wallmirror.derendering.knots import NOISY_STEPS
+from wallmirror.derendering.nested import NOISY_STEPS
 from wallmirror.derendering.noisy import solve_noisy
 from wallmirror.derendering.problem import Problem, prepare
 from wallmirror.derendering.solve import solve

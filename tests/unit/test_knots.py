@@ -21,9 +21,9 @@ from wallmirror.derendering.climbing import climb
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.finer import Films, Finer, loss, score, worth
 from wallmirror.derendering.information import information, point_at
-from wallmirror.derendering.knots import NOISY_STEPS
 from wallmirror.derendering.ladder import Ladder
 from wallmirror.derendering.likelihood import Fit, maximise, moments
+from wallmirror.derendering.nested import NOISY_STEPS
 from wallmirror.derendering.problem import prepare
 from wallmirror.derendering.solve import solve
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
@@ -264,10 +264,13 @@ def test_a_fit_on_coarser_knots_that_comes_to_another_maximum_is_tried_again(see
     astray = maximise(ladder.summed(coarse), ladder.coarsened(fine, best.coefficients), nonnegative=False)
     sound = maximise(ladder.summed(coarse), ladder.closed(coarse).coefficients, nonnegative=False)
     assert astray.objective > 100 * sound.objective  # or there is nothing to try again
-    fits, _ = climb(ladder, fine, False, None, lambda _: None)
-    # The knots that noise alone calls for, with the fit on them as good as a climb ends between knots.
+    fits, _ = climb(ladder, fine, None, False, None, lambda _: None)
+    # The knots that noise alone calls for, with the fit on them as good as a climb ends between knots: but for what those
+    # coefficients gain that the captures hardly see, each a unit of noise.
     assert list(fits) == [coarse]
-    assert fits[coarse].objective == pytest.approx(sound.objective, rel=1e-4)
+    weak = int(np.count_nonzero((ladder.summed(coarse).exposure < 1e-4) & ladder.summed(coarse).seen))
+    assert 0 < weak < 10
+    assert fits[coarse].objective == pytest.approx(sound.objective, abs=weak + 4 * math.sqrt(2 * weak))
 
 
 def test_what_stands_for_a_band_leads_the_search_as_well() -> None:

@@ -170,16 +170,21 @@ def test_a_span_takes_what_is_foretold_or_is_refused(elements: int, monkeypatch:
     data = np.random.default_rng(0).random((800, elements))
     needed: list[float] = []
     with monkeypatch.context() as watched:
-        watched.setattr("wallmirror.derendering.span.require_memory", lambda needs, what: needed.append(needs))
+        for module in ("moments", "span"):
+            watched.setattr(f"wallmirror.derendering.{module}.require_memory", lambda needs, what: needed.append(needs))
         used = peak(lambda: space_within(data, designs, elements, noise=1.0))
+    pairs, *spans = needed
     films_and_designs = 3 * data.nbytes + 5 * sum(t.data.nbytes for t in designs)
-    assert used <= max(needed) + films_and_designs
-    # What the first guard foretells, before there is a Gram matrix, is what refuses; a factor of two, see above, and the
-    # share of entries that a bound on them counts too many.
-    assert max(needed) <= 1.25 * ROOM * used
-    too_large(monkeypatch, f"{needed[0] / 2e9:g}")
-    assert f"the span of {elements} elements" in str(refused(lambda: space_within(data, designs, elements, noise=1.0)))
-    assert peak(lambda: refused(lambda: space_within(data, designs, elements, noise=1.0))) < used / 2
+    assert used <= pairs + max(spans) + films_and_designs
+    # A factor of two, see above, and the share of entries that a bound on them counts too many.
+    assert pairs + max(spans) <= 1.25 * ROOM * used
+    # The first guard refuses before there are pairs, the second before there is a Gram matrix.
+    for left, what, share in [(pairs / 2, "a fit", 0.5), ((pairs + spans[0]) / 2, "the span", 0.9)]:
+        too_large(monkeypatch, f"{left / 1e9:g}")
+        assert f"{what} of {elements} elements" in str(
+            refused(lambda: space_within(data, designs, elements, noise=1.0))
+        )
+        assert peak(lambda: refused(lambda: space_within(data, designs, elements, noise=1.0))) < share * used
 
 
 def test_too_many_knots_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

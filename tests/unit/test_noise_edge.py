@@ -13,7 +13,8 @@ import scipy.stats
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from wallmirror.derendering.span import Span
+from wallmirror.derendering.moments import Moments, moments
+from wallmirror.derendering.span import Projected, Span
 from wallmirror.derendering.splines import design_matrices, grid_for
 from wallmirror.derendering.subspace import noise_edge, signal_space
 from wallmirror.transport import build_kernel
@@ -153,15 +154,20 @@ def test_coarser_knots_follow_from_finer_ones() -> None:
     coarse = grid_for(kernel, step=np.radians(4), degree=3)
     data, halved = noisy(0.2, 0), coarse.in_halved()
     direct = space_within(data, design_matrices(kernel, coarse), ELEMENTS, noise=0.2)
-    fine = Span.of(data, design_matrices(kernel, coarse.halved()))
-    inherited = fine.coarser(halved).projected(ELEMENTS, noise=0.2).space()
+    fine = moments(data, design_matrices(kernel, coarse.halved()))
+
+    def projected(summed: Moments) -> Projected:
+        return Span.of(summed, data.shape[0]).projected(ELEMENTS, noise=0.2)
+
+    every = np.ones((data.shape[0], 1))
+    inherited = projected(fine.coarser(halved)).space(design_matrices(kernel, coarse), every)
     assert (inherited.rank, inherited.dimensions) == (direct.rank, direct.dimensions)
     # Both know the span's weakest directions to 2e-16 / 1e-10.
     np.testing.assert_allclose(inherited.singular_values, direct.singular_values, rtol=1e-5)
     assert np.max(sl.subspace_angles(inherited.basis, direct.basis)) < 1e-4
-    assert fine.projected(ELEMENTS, noise=0.2).dimensions > direct.dimensions
+    assert projected(fine).dimensions > direct.dimensions
     # The planted fault: coefficients of coarser knots that are put one knot aside.
-    shifted = fine.coarser(sp.csr_array(np.roll(halved.toarray(), 1, axis=0))).projected(ELEMENTS, noise=0.2)
+    shifted = projected(fine.coarser(sp.csr_array(np.roll(halved.toarray(), 1, axis=0))))
     assert np.max(np.abs(shifted.singular_values / direct.singular_values - 1)) > 1e-3
 
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.finer import Films, Finer, loss, score, worth
-from wallmirror.derendering.information import information
-from wallmirror.derendering.ladder import ROUGH, SPARE, Ladder
-from wallmirror.derendering.likelihood import Fit, maximise
+from wallmirror.derendering.information import information, schur_on
+from wallmirror.derendering.ladder import SPARE, Ladder
+from wallmirror.derendering.likelihood import Fit, best_nonnegative, maximise
 from wallmirror.errors import UndeterminedError
 
 Array = NDArray[np.float64]
@@ -46,18 +46,24 @@ class Other:
 
 
 def climb(
-    ladder: Ladder, begin: int, nonnegative: bool, tolerance: float | None, tell: Tell
+    ladder: Ladder, begin: int, start: Array | None, nonnegative: bool, tolerance: float | None, tell: Tell
 ) -> tuple[dict[int, Fit], Other | None]:
-    """The free fits on the knots taken, by index, and what finer ones that were not would make of the last."""
+    """The free fits on the knots taken, by index, and what finer ones that were not would make of the last.
+
+    Parameters
+    ----------
+    begin, start:
+        Index of the first knots to be fitted, and the r to start from, shape (K,), if not the closed form's.
+    """
 
     def fit(index: int, *starts: Array) -> Fit:
-        found = maximise(ladder.summed(index), *starts, nonnegative=False, tolerance=ROUGH)
+        found = maximise(ladder.summed(index), *starts, nonnegative=False, rough=True)
         tell(f"knots every {math.degrees(ladder.grids[index].step):g} deg: misfit {found.objective:.6g}")
         return found
 
     index = begin
     ladder.summed(index)  # of which the closed form makes use
-    best = fit(index, ladder.closed(index).coefficients)
+    best = fit(index, ladder.closed(index).coefficients if start is None else start)
     rival: Other | None = None
     finer_fits: dict[int, Fit] = {}
     while index > 0 and (foretold := _coarser(ladder, index, best, tell)) is not None:
@@ -71,11 +77,7 @@ def climb(
         losses = ((finer, each, coarser.objective - each.objective) for finer, each in finer_fits.items())
         if any(loss >= ladder.price(index - 1, finer, each) for finer, each, loss in losses):
             break
-        if (
-            nonnegative
-            and index >= ladder.last - 1
-            and _in_the_light(ladder, index - 1, coarser, index, tell) is not None
-        ):
+        if nonnegative and index >= ladder.last - 1 and _missed_in_the_light(ladder, index - 1, coarser, best, tell):
             break
         rival = Other(best.source, best.objective)
         index, best = index - 1, coarser
@@ -136,28 +138,62 @@ def _finer(
     Where rho >= 0 leaves most of the angles dark, it is enough if finer knots pay in the lit ones, where their error lies.
     """
     start = ladder.refined(index, best.coefficients, finer)
-    if finer < ladder.last - 1:  # coarse still: to try is no dearer than to tell
-        return _paying(ladder, index, best, finer, fit(finer, start))
-    every = np.ones(start.size, dtype=bool)
-    found, price = _tested(ladder, index, best, finer, every, ladder.seen(index), tell)
-    if found.gain >= price:
-        return _paying(ladder, index, best, finer, fit(finer, start + found.step, start))
-    lit = _in_the_light(ladder, index, best, finer, tell) if nonnegative else None
-    if lit is not None:
-        trial = fit(finer, start + lit.step, start)
-        return trial, Other(trial.source, trial.objective)
-    return None, _stepped(ladder, finer, start + found.step)
+    tried: Fit | None = None
+    if finer < ladder.last - 1 or ladder.holds(finer):  # to try is no dearer than to tell
+        tried = fit(finer, start)
+        taken, other = _paying(ladder, index, best, finer, tried)
+        if taken is not None or finer < ladder.last - 1:
+            return taken, other
+    else:
+        every = np.ones(start.size, dtype=bool)
+        found, price = _tested(ladder, index, best, finer, every, ladder.seen(index), tell)
+        if found.gain >= price:
+            return _paying(ladder, index, best, finer, fit(finer, start + found.step, start))
+        other = _stepped(ladder, finer, start + found.step)
+    if not nonnegative:
+        return None, other
+    if tried is None and (lit := _in_the_light(ladder, index, best, finer, tell)) is not None:
+        tried = fit(finer, start + lit.step, start)
+    elif tried is not None and not _missed_in_the_light(ladder, index, best, tried, tell):
+        tried = None
+    return tried, other if tried is None else Other(tried.source, tried.objective)
 
 
 def _in_the_light(ladder: Ladder, index: int, best: Fit, finer: int, tell: Tell) -> Finer | None:
     """What finer knots gain where rho >= 0 is lit, if it leaves most of the angles dark and the gain is worth them."""
     within = ladder.bounded(index, best)
-    lit = within.coefficients > _LIT * float(np.max(within.coefficients[ladder.summed(index).exposure > _WELL_SEEN]))
+    lit = _lit(ladder, index, within.coefficients)
     free = ladder.refined(index, lit.astype(np.float64), finer) > 0
     if np.count_nonzero(free) >= _SPARSE * free.size:
         return None
     found, price = _tested(ladder, index, within, finer, free, int(np.count_nonzero(lit)), tell)
     return found if found.gain >= price else None
+
+
+def _missed_in_the_light(ladder: Ladder, index: int, best: Fit, finer: Fit, tell: Tell) -> bool:
+    """The same, told from the free fit on the next finer knots: whether the coarser ones miss too much of it in the light."""
+    lit = _lit(ladder, index, best_nonnegative(ladder.summed(index), best.source))
+    halved = ladder.grids[index].in_halved()
+    free = halved @ lit.astype(np.float64) > 0
+    if np.count_nonzero(free) >= _SPARSE * free.size:
+        return False
+    within, summed = ladder.bounded(index + 1, finer), ladder.summed(index + 1)
+    cells = np.flatnonzero(free & summed.seen)
+    schur = schur_on(summed, within.coefficients, within.source, cells)
+    pull = np.einsum("ib,bik->k", within.source, summed.cross)[cells]
+    missed, _ = loss(schur, within.coefficients[cells], pull, sp.csr_array(halved[cells][:, lit]))
+    freedom = ladder.freedom(index + 1)
+    price = worth(max(1, cells.size - int(np.count_nonzero(lit))), freedom) * ladder.variance(finer.objective, freedom)
+    tell(
+        f"knots every {math.degrees(ladder.grids[index].step):g} deg would raise it by {missed:.4g} in the light, noise by up "
+        f"to {price:.4g}"
+    )
+    return missed >= price
+
+
+def _lit(ladder: Ladder, index: int, r: Array) -> NDArray[np.bool_]:
+    """Which coefficients of a rho >= 0 are lit, shape (K,)."""
+    return np.asarray(r > _LIT * float(np.max(r[ladder.summed(index).exposure > _WELL_SEEN])))
 
 
 def _paying(ladder: Ladder, index: int, best: Fit, finer: int, trial: Fit) -> tuple[Fit | None, Other]:

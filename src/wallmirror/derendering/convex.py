@@ -57,6 +57,36 @@ def minimise_above(floor: Array, quadratic: Array, linear: Array) -> Array:
     return np.maximum(best, 0.0) + floor
 
 
+def minimise_each(quadratic: Array, linear: Array) -> Array:
+    """Minimise 1/2 x Q x - q x over x >= 0 for each of many small Q at once, by the same pivoting as `minimise_above`.
+
+    Parameters
+    ----------
+    quadratic, linear:
+        Each Q, symmetric positive definite, (n, m, m), and q, (n, m).
+
+    Returns
+    -------
+    The x, shape (n, m).
+    """
+    free = linear > 0
+    best, fewest = np.zeros_like(linear), np.full(len(linear), linear.shape[1] + 1)
+    slack = 1e-9 * np.max(np.abs(linear), axis=1, keepdims=True, initial=0.0)
+    own = np.eye(linear.shape[1]) * np.trace(quadratic, axis1=1, axis2=2)[:, None, None]
+    for _ in range(_PIVOTS):
+        inside = np.where(free[:, :, None] & free[:, None], quadratic, own)  # a bound variable by itself, of value 0
+        x = np.linalg.solve(inside, np.where(free, linear, 0.0)[..., None])[..., 0]
+        pull = linear - np.einsum("nij,nj->ni", quadratic, x)
+        wrong = np.where(free, x < -1e-12 * np.max(np.abs(x), axis=1, keepdims=True, initial=0.0), pull > slack)
+        count = np.count_nonzero(wrong, axis=1)
+        better = count < fewest
+        best[better], fewest[better] = x[better], count[better]
+        if not np.any(count):
+            break
+        free = free ^ wrong
+    return np.maximum(best, 0.0)
+
+
 def solve_positive(matrix: Array, right: Array) -> Array:
     """Solve by Cholesky, several times faster than `scipy.linalg.solve`, which also estimates the condition.
 

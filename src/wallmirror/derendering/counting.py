@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.bounds import Bound
 from wallmirror.derendering.estimate import Estimate, doubts_of_fit
-from wallmirror.derendering.knots import NOISY_STEPS, refine
+from wallmirror.derendering.knots import refine
+from wallmirror.derendering.nested import NOISY_STEPS
 from wallmirror.derendering.patterns import trusted_bound
 from wallmirror.derendering.poisson import maximise_poisson, poisson_bound
 from wallmirror.derendering.problem import Problem, prepare

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wallmirror.derendering.convex import minimise_above
+from wallmirror.derendering.convex import minimise_each
 from wallmirror.derendering.moments import Moments
 from wallmirror.errors import UndeterminedError
 
@@ -80,6 +80,13 @@ def information(data: Moments, coefficients: Array, source: Array, schur: Array 
     return Information(schur, inverse, coupled, seen)
 
 
+def schur_on(data: Moments, coefficients: Array, source: Array, cells: NDArray[np.intp]) -> Array:
+    """S at r (K,) and V (M, B) on some coefficients, as if the others were known."""
+    point = point_at(data, coefficients, source.T)
+    free = np.ones_like(point.v, dtype=bool)
+    return schur_complement(data, point, free, inverses(data, point, free), cells)
+
+
 def point_at(data: Moments, r: Array, v: Array | None = None, *, nonnegative: bool = False) -> Point:
     """The point with r (K,), and with the pattern v (B, M) or, where none is given, the best one, V >= 0 if need be."""
     m = data.elements
@@ -91,9 +98,8 @@ def point_at(data: Moments, r: Array, v: Array | None = None, *, nonnegative: bo
         ridge = level[:, None, None] * np.eye(m)
         v = np.linalg.solve((normal + ridge)[data.group], moment[..., None])[..., 0]
         if nonnegative:
-            for b in np.flatnonzero(np.any(v < 0, axis=1)):
-                quadratic_b = normal[data.group[b]] + ridge[data.group[b]]
-                v[b] = minimise_above(np.zeros(m), quadratic_b, moment[b])
+            below = np.flatnonzero(np.any(v < 0, axis=1))
+            v[below] = minimise_each((normal + ridge)[data.group[below]], moment[below])
     quadratic = np.einsum("bi,bij,bj->b", v, normal[data.group], v)
     objective = float(np.sum(data.energy - 2 * np.sum(v * moment, axis=1) + quadratic))
     return Point(r, v, normal, moment, pair, objective)
@@ -124,11 +130,12 @@ def inverses(data: Moments, point: Point, free: NDArray[np.bool_]) -> Array:
         raise unseen_pattern()
     ridge = 1e-14 * trace[:, None, None] * np.eye(m)
     inverse = np.linalg.inv(point.normal + ridge)[data.group]
-    for b in np.flatnonzero(~np.all(free, axis=1)):
-        both = free[b, :, None] & free[b]
-        normal = point.normal[data.group[b]]
-        kept = np.where(both, normal, np.eye(m) * np.trace(normal))
-        inverse[b] = np.where(both, np.linalg.inv(kept + 1e-14 * np.trace(kept) * np.eye(m)), 0.0)
+    bound = np.flatnonzero(~np.all(free, axis=1))
+    both = free[bound, :, None] & free[bound, None]
+    own = trace[data.group[bound], None, None] * np.eye(m)
+    kept = np.where(both, point.normal[data.group[bound]], own)
+    kept = kept + 1e-14 * np.trace(kept, axis1=1, axis2=2)[:, None, None] * np.eye(m)
+    inverse[bound] = np.where(both, np.linalg.inv(kept), 0.0)
     return np.asarray(inverse)
 
 

@@ -20,7 +20,7 @@ from wallmirror.derendering.finer import worth
 from wallmirror.derendering.groups import Groups
 from wallmirror.derendering.information import Information, information
 from wallmirror.derendering.ladder import SPARE, Ladder
-from wallmirror.derendering.likelihood import Fit, finished
+from wallmirror.derendering.likelihood import Fit, maximise
 from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.problem import Problem, expected_mismatch, too_few_patterns
 from wallmirror.derendering.splines import SplineGrid
@@ -29,8 +29,6 @@ from wallmirror.errors import InputError, UndeterminedError
 
 Array = NDArray[np.float64]
 
-#: Knot spacings in degrees, each half of the one before.
-NOISY_STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
 # A mismatch in units of what noise makes of it, beyond which knots are too coarse to be fitted; the share of it below
 # which the gap says that they are too fine; the share of it that finer knots leave if it is not for the knots; and the closed
 # form's own error up to which it is a start.
@@ -38,6 +36,9 @@ _FAR_OFF = 2.0
 _ALIKE = 0.9
 _GAP = 1.0
 _START = 1.0
+# How many times what noise would pay for the next finer knots' coefficients must be foretold of them for the coarser ones not
+# to be fitted first: those cost a quarter, and are the better start.
+_SURELY = 3.0
 
 
 @dataclass(frozen=True)
@@ -128,10 +129,10 @@ def refine(
         If fewer patterns than elements stand out of the noise, or no knots are coarse enough to be determined.
     """
     ladder = Ladder.of(problem, space, steps, tolerance)
-    begin = _first_worth_a_fit(ladder, nonnegative)
+    begin, start = _first_worth_a_fit(ladder)
     while True:
         try:
-            fits, rival = climb(ladder, begin, nonnegative, tolerance, tell)
+            fits, rival = climb(ladder, begin, start, nonnegative, tolerance, tell)
         except UndeterminedError:
             if begin == 0 and space.rank < problem.card.elements:
                 raise too_few_patterns(space.rank, problem.card.elements) from None
@@ -151,7 +152,7 @@ def refine(
             rival = None
         if begin == 0:
             break
-        begin -= 1
+        begin, start = begin - 1, None
     if space.rank < problem.card.elements:
         raise too_few_patterns(space.rank, problem.card.elements)
     raise UndeterminedError(
@@ -162,7 +163,7 @@ def refine(
 def _level(ladder: Ladder, index: int, free: Fit, nonnegative: bool) -> Level | None:
     """The fit within the bounds asked for, or None where its error bars say that nothing determines it."""
     summed = ladder.summed(index)
-    fit = ladder.bounded(index, free) if nonnegative else finished(summed, free)
+    fit = ladder.bounded(index, free) if nonnegative else maximise(summed, free.coefficients, nonnegative=False)
     grid, groups = ladder.grids[index], ladder.groups(index)
     if len(groups) > 1:
         fit = groups.scaled(fit, grid, summed.exposure)
@@ -171,36 +172,40 @@ def _level(ladder: Ladder, index: int, free: Fit, nonnegative: bool) -> Level | 
     return level if math.isfinite(level.bound.source_error) else None
 
 
-def _first_worth_a_fit(ladder: Ladder, nonnegative: bool) -> int:
+def _first_worth_a_fit(ladder: Ladder) -> tuple[int, Array | None]:
     """Index of knots whose closed form misses the data's space by about what noise makes it miss, and is a start.
 
     Coarser ones are far from explaining the films, and a fit on them would only be a start for the next. Where finer ones
     miss as much, it is not for the knots; where none comes near, or the noise is not known, the search begins with the
     coarsest. Mismatches as a whole do not show a spline's error that a fit would: that is foretold from the detail of rho.
+    With the index comes a start r, shape (K,), if it is not the closed form on these knots.
     """
     if ladder.space.rank < ladder.problem.card.elements:
-        return 0
+        return 0, None
     index = max(0, ladder.last - 2)
-    if _wants_detail(ladder, index + 1, nonnegative):
+    excess = _excess_of_detail(ladder, index + 1)
+    if not math.isnan(excess):
         closed = ladder.closed(index + 1)
         if not closed.mismatch > _FAR_OFF * expected_mismatch(ladder.problem, ladder.space, closed) and _starts(closed):
-            return index + 1
+            if excess > _SURELY:
+                return index + 1, None
+            return index, ladder.coarsened(index + 1, closed.coefficients)
     ladder.summed(index)  # which nearly every search asks for, and of which the closed form makes use
     closed = ladder.closed(index)
     expected = expected_mismatch(ladder.problem, ladder.space, closed)
     if math.isnan(expected):
-        return 0
+        return 0, None
     if not closed.mismatch > _FAR_OFF * expected:
-        return index if _starts(closed) else 0
+        return (index if _starts(closed) else 0), None
     for finer in range(index + 1, ladder.last + 1):
         if closed.gap < _GAP * closed.mismatch:
             break
         coarser, closed = closed, ladder.closed(finer)
         if not closed.mismatch > _FAR_OFF * expected_mismatch(ladder.problem, ladder.space, closed):
-            return finer
+            return finer, None
         if closed.mismatch > _ALIKE * coarser.mismatch:
-            return finer - 1 if coarser.error < _START else 0
-    return 0
+            return (finer - 1 if coarser.error < _START else 0), None
+    return 0, None
 
 
 def _starts(closed: ClosedForm) -> bool:
@@ -208,20 +213,25 @@ def _starts(closed: ClosedForm) -> bool:
     return closed.gap > _GAP * closed.mismatch and closed.error < _START
 
 
-def _wants_detail(ladder: Ladder, index: int, nonnegative: bool) -> bool:
-    """Whether the noise is so faint that knots twice as far apart will hardly do, so that the search begins with these."""
+def _excess_of_detail(ladder: Ladder, index: int) -> float:
+    """The misfit of knots twice as far apart, for their splines' sake, over what noise would pay for these beyond the mean.
+
+    NaN where the noise is not known, or drowns all detail without a look.
+    """
     problem = ladder.problem
     if index < 2 or index == ladder.last or not problem.noise_is_stated or ladder.spare(index) < SPARE:
-        return False
-    # Where rho >= 0 may leave all angles dark but for one lobe, these need to pay there alone.
+        return math.nan
     grid, coarser = ladder.grids[index], ladder.grids[index - 1]
-    added = grid.degree + 1 if nonnegative else grid.size - coarser.size
-    excess = worth(added, problem.data.size) - added  # noise pays for the others in the mean
-    # No more than all of the films can be detail.
-    if ladder.foretold(index, float(np.sum(problem.fit_weights * problem.data**2))) < excess:
-        return False
+
+    def excess(added: int) -> float:
+        return worth(added, problem.data.size) - added
+
+    # No more than all of the films can be detail. Where rho >= 0 leaves all angles dark but for one lobe, it need pay there
+    # alone.
+    if ladder.foretold(index, float(np.sum(problem.fit_weights * problem.data**2))) < excess(grid.degree + 1):
+        return math.nan
     try:
         ladder.summed(index)  # from which those of coarser knots follow, whichever the search begins with
     except InputError:  # the memory does not hold them
-        return False
-    return ladder.foretold(index, ladder.detail(index)) > excess
+        return math.nan
+    return ladder.foretold(index, ladder.detail(index)) / excess(grid.size - coarser.size)

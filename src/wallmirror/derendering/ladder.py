@@ -1,7 +1,4 @@
-"""Nested spline grids for the BRDF of one problem, with what a fit needs of the data on each, made when first asked for.
-
-Every grid halves the knot spacing of the one before, so that the splines of each lie among those of the next.
-"""
+"""The nested grids of one problem, with the fits on each and what these need, made when first asked for."""
 
 from __future__ import annotations
 
@@ -16,41 +13,26 @@ from numpy.typing import NDArray
 from wallmirror.derendering.finer import worth
 from wallmirror.derendering.groups import Groups, closed_form_in_groups, groups_of
 from wallmirror.derendering.likelihood import Fit, best_nonnegative, maximise
-from wallmirror.derendering.moments import Moments, moments
+from wallmirror.derendering.moments import Moments
+from wallmirror.derendering.nested import FINEST_QUADRATURE, Nested
 from wallmirror.derendering.problem import Problem
-from wallmirror.derendering.splines import SplineGrid, design_matrices, exposures
+from wallmirror.derendering.splines import SplineGrid, exposures
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, banded_gram, closed_form
 from wallmirror.errors import UndeterminedError
-from wallmirror.transport import Kernel
 
 Array = NDArray[np.float64]
 
-#: Between knots the fits need not be finer than this share of the misfit.
-ROUGH = 1e-5
 #: Share of the data that finer knots must leave over.
 SPARE = 0.25
-# That of the closed form: splines of degree 3 need knots half as far apart for lobes of the same width.
-_DEGREE = 7
-# Quadrature of the fit, of a lobe's peak.
-_FINEST_QUADRATURE = 1e-5
 
 
 @dataclass(frozen=True)
 class Ladder:
-    """The grids, coarsest first, and what belongs to each by its index.
-
-    Parameters
-    ----------
-    quadrature:
-        Error of the quadrature, of a lobe's peak.
-    """
+    """What belongs to each of the grids by its index, coarsest first."""
 
     problem: Problem
     space: SignalSpace
-    grids: tuple[SplineGrid, ...]
-    quadrature: float
-    _kernels: dict[int, Kernel] = field(default_factory=dict)
-    _designs: dict[int, list[sp.csr_array]] = field(default_factory=dict)
+    nested: Nested
     _summed: dict[int, Moments] = field(default_factory=dict)
     _bands: dict[int, Array] = field(default_factory=dict)
     _smooth_bands: dict[int, Array] = field(default_factory=dict)
@@ -62,45 +44,32 @@ class Ladder:
     @classmethod
     def of(cls, problem: Problem, space: SignalSpace, steps: tuple[float, ...], tolerance: float | None) -> Ladder:
         """Over the angle sums of a problem; one spacing in degrees, or several, each half of the one before."""
-        quadrature = _quadrature(problem, tolerance)
-        finest = problem.kernel(steps[-1], quadrature)
-        u = finest.angle_sum
-        room = math.radians(steps[-1]) if len(steps) > 1 else 0.0  # other quadratures reach a little further
-        grids = [
-            SplineGrid.covering(
-                float(u.min()) - room, float(u.max()) + room, step=math.radians(steps[0]), degree=_DEGREE
-            )
-        ]
-        for _ in steps[1:]:
-            grids.append(grids[-1].halved())
-        return cls(problem, space, tuple(grids), quadrature, {len(steps) - 1: finest})
+        return cls(problem, space, problem.nested(steps, _quadrature(problem, tolerance)))
+
+    @property
+    def grids(self) -> tuple[SplineGrid, ...]:
+        """The grids."""
+        return self.nested.grids
 
     @property
     def last(self) -> int:
         """Index of the finest grid."""
-        return len(self.grids) - 1
+        return self.nested.last
 
     def designs(self, index: int) -> list[sp.csr_array]:
         """T_1 .. T_M, each sparse (P, K)."""
-        if index not in self._designs:
-            # One quadrature for all knots but the finest, so that their misfits differ for the knots' sake alone.
-            finer = max(index, self.last - 1)
-            if finer not in self._kernels:
-                self._kernels[finer] = self.problem.kernel(math.degrees(self.grids[finer].step), self.quadrature)
-            self._designs[index] = design_matrices(self._kernels[finer], self.grids[index])
-        return self._designs[index]
+        return self.nested.designs(index)
 
     def summed(self, index: int) -> Moments:
-        """What the likelihood needs of the data."""
+        """What the likelihood needs of the data, and which coefficients have scales of their own."""
         if index not in self._summed:
-            if index + 1 < self.last and (index + 1 in self._summed or index + 2 < self.last):
-                # Every search that comes to the coarsest knots tries the next ones, of which theirs follow at once.
-                made = self.summed(index + 1).coarser(self.grids[index].in_halved())
-            else:
-                made = moments(self.problem.data, self.designs(index), self.problem.inverse_variance)
-            groups = self.groups(index)
+            made, groups = self.nested.moments(index), self.groups(index)
             self._summed[index] = replace(made, apart=groups.cells) if len(groups) > 1 else made
         return self._summed[index]
+
+    def holds(self, index: int) -> bool:
+        """Whether `summed` takes no pass over the pixels any more."""
+        return self.nested.holds(index)
 
     def closed(self, index: int) -> ClosedForm:
         """The closed form."""
@@ -123,7 +92,7 @@ class Ladder:
     def groups(self, index: int) -> Groups:
         """The elements that share coefficients on these knots."""
         if index not in self._groups:
-            finer = self._groups.get(index + 1)
+            finer = self.groups(index + 1) if index < self.last and self.nested.holds(index + 1) else None
             if finer is not None and len(finer) == 1:  # broader splines are shared by no fewer
                 seen = self.grids[index].in_halved().T @ finer.cells.T.astype(np.float64) > 0
                 self._groups[index] = Groups(finer.elements, seen.T)
@@ -184,7 +153,7 @@ class Ladder:
             return self.closed(0).coefficients
         if index - 1 not in self._free:
             start = self.closed(index - 1).coefficients
-            self._free[index - 1] = maximise(self.summed(index - 1), start, nonnegative=False, tolerance=ROUGH)
+            self._free[index - 1] = maximise(self.summed(index - 1), start, nonnegative=False, rough=True)
         return self.refined(index - 1, self.bounded(index - 1, self._free[index - 1]).coefficients, index)
 
     def as_fine_as_the_bounds_want(self, index: int, free: Fit) -> tuple[int, Fit]:
@@ -201,7 +170,7 @@ class Ladder:
         ):
             try:
                 start = self.refined(index, free.coefficients, index + 1)
-                finer = maximise(self.summed(index + 1), start, nonnegative=False, tolerance=ROUGH)
+                finer = maximise(self.summed(index + 1), start, nonnegative=False, rough=True)
                 gain = self.bounded(index, free).objective - self.bounded(index + 1, finer).objective
             except UndeterminedError:
                 break
@@ -283,7 +252,7 @@ def _nearest(prolongation: sp.csr_array, r: Array, exposure: Array) -> Array:
 def _quadrature(problem: Problem, tolerance: float | None) -> float:
     """Quadrature error, of a lobe's peak, that a tolerance of the pattern allows and the noise hides."""
     if tolerance is None or problem.inverse_variance is None or not problem.noise_is_stated:
-        return _FINEST_QUADRATURE
+        return FINEST_QUADRATURE
     weights = problem.inverse_variance[problem.inverse_variance > 0]
     hidden = 0.1 / math.sqrt(float(np.median(weights)))
-    return min(1e-3, max(_FINEST_QUADRATURE, min(1e-2 * tolerance, hidden)))
+    return min(1e-3, max(FINEST_QUADRATURE, min(1e-2 * tolerance, hidden)))

@@ -14,7 +14,6 @@ Non-negativity turns each step into a convex quadratic programme, solved by bloc
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,15 +25,18 @@ from wallmirror.derendering.information import Point, inverses, mixed, point_at,
 from wallmirror.derendering.moments import Moments, moments
 from wallmirror.errors import UndeterminedError
 
-__all__ = ["Fit", "Moments", "best_nonnegative", "finished", "maximise", "moments"]
+__all__ = ["Fit", "Moments", "best_nonnegative", "maximise", "moments"]
 
 Array = NDArray[np.float64]
 
 # Cells seen less than this relative to the best-seen one are weak: noise rules them in a start.
 _WEAK = 1e-4
 _RIDGE = 1e-12
-# Share of the misfit by which a full step may still lower it.
-_TOLERANCE = 1e-7
+# Share of the misfit by which a full step may still lower it, and by which one of a rough climb may.
+_TOLERANCE, _ROUGH = 1e-7, 1e-5
+# What holds the coefficients of a rough climb back, of the information that would leave one as uncertain as the largest one is
+# large: noise throws those that the captures hardly see about, and with them all others off the maximum.
+_DAMPING = 0.1
 # S is made anew where a step with that of the point before promises more than this share of what the last one did, or so
 # little, as a share of what ends the climb, that the climb seems to be over.
 _QUICK = 0.1
@@ -61,8 +63,6 @@ class Fit:
         Whether the last step was below the tolerance.
     schur:
         S at the maximum, over the seen coefficients, where it is at hand.
-    promised:
-        By how much a full step would still lower the objective, where that is known.
     """
 
     coefficients: Array
@@ -71,7 +71,6 @@ class Fit:
     iterations: int
     converged: bool
     schur: Array | None = None
-    promised: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -89,14 +88,14 @@ class _Curvature:
     pinned:
         S with the gauge; None where nothing depends on r.
     factor:
-        The Cholesky factor of that, as `positive_factor` makes it, where r has no bounds.
+        The Cholesky factor of that, as `positive_factor` makes it, where r has no bounds; of a rough climb with its damping.
     """
 
     free: NDArray[np.bool_]
     inverse: Array
     schur: Array
-    pinned: Array | None
-    factor: Array | None
+    pinned: Array | None = None
+    factor: Array | None = None
 
 
 def maximise(
@@ -104,6 +103,7 @@ def maximise(
     *starts: Array,
     nonnegative: bool = True,
     tolerance: float = _TOLERANCE,
+    rough: bool = False,
     max_iterations: int = 60,
 ) -> Fit:
     """Climb to the maximum of the likelihood from the best of some starts (the closed form's r, a coarser fit).
@@ -116,6 +116,9 @@ def maximise(
         Keep r >= 0 and V >= 0.
     tolerance:
         Stop when a full step promises to change the objective by less than this share.
+    rough:
+        Stop earlier still, near the maximum without bounds: what is left to gain hangs on coefficients that the captures
+        hardly see.
 
     Raises
     ------
@@ -130,11 +133,17 @@ def maximise(
     curvature: _Curvature | None = None
     slope = 0.0
     for iteration in range(1, max_iterations + 1):
-        enough = tolerance * state.objective + rounding
-        last, between = curvature, (_SURE * enough, _QUICK * slope)
-        dr, slope, curvature = _step(data, state, seen, last, between, nonnegative=nonnegative)
-        if slope <= enough and curvature is not last:
-            return _fit(state, iteration, converged=True, promised=slope, curvature=curvature)
+        enough = (max(tolerance, _ROUGH) if rough else tolerance) * state.objective + rounding
+        pull = _pull(data, state, nonnegative=nonnegative)
+        before, quick = slope, False
+        if curvature is not None and np.array_equal(pull.free, curvature.free):
+            dr, slope = _step(data, state, pull, curvature)
+            quick = _SURE * enough < slope <= _QUICK * before
+        if not quick:
+            curvature = _curvature(data, state, pull.free, nonnegative=nonnegative, rough=rough)
+            dr, slope = _step(data, state, pull, curvature)
+            if slope <= enough:
+                return _fit(state, iteration, converged=True, curvature=curvature)
         length = 1.0
         while True:
             trial = point_at(data, state.r + length * dr, nonnegative=nonnegative)
@@ -145,13 +154,6 @@ def maximise(
                 return _fit(state, iteration, converged=slope <= 1e-6 * state.objective + 1e3 * rounding)
         state = trial
     return _fit(state, max_iterations, converged=False)
-
-
-def finished(data: Moments, fit: Fit) -> Fit:
-    """The maximum without bounds, to the full tolerance, where a fit came near it that a larger one sufficed."""
-    if fit.promised <= _TOLERANCE * fit.objective:
-        return fit
-    return maximise(data, fit.coefficients, nonnegative=False)
 
 
 def best_nonnegative(data: Moments, source: Array) -> Array:
@@ -176,67 +178,67 @@ def _fit(
     iterations: int,
     *,
     converged: bool,
-    promised: float = math.inf,
     curvature: _Curvature | None = None,
 ) -> Fit:
     # With entries of V at their bounds the curvature counts these as known, which the information does not.
     schur = curvature.schur if curvature is not None and np.all(curvature.free) else None
-    return Fit(state.r, state.v.T.copy(), state.objective, iterations, converged, schur, promised)
+    return Fit(state.r, state.v.T.copy(), state.objective, iterations, converged, schur)
 
 
-def _step(
-    data: Moments,
-    state: Point,
-    seen: NDArray[np.bool_],
-    last: _Curvature | None,
-    between: tuple[float, float],
-    *,
-    nonnegative: bool,
-) -> tuple[Array, float, _Curvature]:
-    """The Gauss-Newton step in r with V eliminated, the decrease of the objective that it promises, and its curvature.
+@dataclass(frozen=True)
+class _Pull:
+    """The gradient of the objective at a point, turned round: in r (K,) and in V (B, M), of the entries of V that may move."""
 
-    Near the maximum the curvature hardly changes: the last step's does for promises `between` two values. Whether the climb
-    is over, only the curvature of the place itself may say.
+    r: Array
+    v: Array
+    free: NDArray[np.bool_]
+
+
+def _pull(data: Moments, state: Point, *, nonnegative: bool) -> _Pull:
+    v = state.moment - np.einsum("bij,bj->bi", state.normal[data.group], state.v)
+    r = np.einsum("bi,bik->k", state.v, data.cross) - mixed(data, state, state.v)
+    free = (state.v > 0) | (v > 0) if nonnegative else np.ones_like(state.v, dtype=bool)
+    return _Pull(r, np.where(free, v, 0.0), free)
+
+
+def _step(data: Moments, state: Point, pull: _Pull, curvature: _Curvature) -> tuple[Array, float]:
+    """The Gauss-Newton step in r with V eliminated, and the decrease of the objective that it promises.
+
+    Near the maximum the curvature hardly changes: that of the point before does. Whether the climb is over, only the curvature
+    of the place itself may say.
     """
-    grad_v = state.moment - np.einsum("bij,bj->bi", state.normal[data.group], state.v)
-    grad_r = np.einsum("bi,bik->k", state.v, data.cross) - mixed(data, state, state.v)
-    free = (state.v > 0) | (grad_v > 0) if nonnegative else np.ones_like(state.v, dtype=bool)
-    grad_v = np.where(free, grad_v, 0.0)
-    cells = np.flatnonzero(seen)
-
-    def along(curvature: _Curvature) -> tuple[Array, float, _Curvature]:
-        eliminated = np.einsum("bij,bj->bi", curvature.inverse, grad_v)
-        right = (grad_r - mixed(data, state, eliminated))[cells]
-        dr = np.zeros_like(state.r)
-        if nonnegative and curvature.pinned is not None:
-            dr[cells] = minimise_above(-state.r[cells], curvature.pinned, right)
-        elif curvature.factor is not None:
-            dr[cells] = sl.cho_solve((curvature.factor, True), right, check_finite=False)
-        return dr, float(grad_r @ dr), curvature
-
-    if last is not None and np.array_equal(free, last.free):
-        found = along(last)
-        if between[0] < found[1] <= between[1]:
-            return found
-    return along(_curvature(data, state, free, cells, nonnegative=nonnegative))
+    cells = np.flatnonzero(data.seen)
+    eliminated = np.einsum("bij,bj->bi", curvature.inverse, pull.v)
+    right = (pull.r - mixed(data, state, eliminated))[cells]
+    dr = np.zeros_like(state.r)
+    if curvature.factor is not None:
+        dr[cells] = sl.cho_solve((curvature.factor, True), right, check_finite=False)
+    elif curvature.pinned is not None:
+        dr[cells] = minimise_above(-state.r[cells], curvature.pinned, right)
+    return dr, float(pull.r @ dr)
 
 
-def _curvature(
-    data: Moments, state: Point, free: NDArray[np.bool_], cells: NDArray[np.intp], *, nonnegative: bool
-) -> _Curvature:
+def _curvature(data: Moments, state: Point, free: NDArray[np.bool_], *, nonnegative: bool, rough: bool) -> _Curvature:
     if not nonnegative and np.max(np.linalg.cond(state.normal)) > _LOST:
         raise UndeterminedError(
             "the captures do not tell the card's elements apart; capture more light, views or patterns"
         )
+    cells = np.flatnonzero(data.seen)
     inverse = inverses(data, state, free)
     schur = schur_complement(data, state, free, inverse, cells)
     r = state.r[cells]
     level = np.trace(schur) / max(1, cells.size)
     if not level > 0:
-        return _Curvature(free, inverse, schur, None, None)
+        return _Curvature(free, inverse, schur)
     # The gauge r r^T keeps the step off the null direction of each scale; the ridge is for barely seen cells.
     null = r[None] if data.apart is None else np.where(data.apart[:, cells], r, 0.0)
     null = null / np.maximum(np.linalg.norm(null, axis=1, keepdims=True), 1e-150)
     pinned = schur + level * null.T @ null
     pinned[np.diag_indices_from(pinned)] += _RIDGE * level
-    return _Curvature(free, inverse, schur, pinned, None if nonnegative else positive_factor(pinned))
+    if nonnegative:
+        return _Curvature(free, inverse, schur, pinned)
+    largest = float(np.max(np.abs(state.r), where=data.exposure >= _WEAK, initial=0.0))
+    if rough and largest > 0:
+        noise = max(0.0, state.objective) / max(1, data.observations)
+        pinned[np.diag_indices_from(pinned)] += _DAMPING * noise / largest**2
+    return _Curvature(free, inverse, schur, pinned, positive_factor(pinned))

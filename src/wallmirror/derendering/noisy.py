@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from wallmirror.derendering.components import in_words
 from wallmirror.derendering.estimate import Estimate, doubts_of_fit, scale_free_error
-from wallmirror.derendering.knots import NOISY_STEPS, Refined, refine
+from wallmirror.derendering.knots import Refined, refine
+from wallmirror.derendering.nested import NOISY_STEPS
 from wallmirror.derendering.patterns import trusted_bound
 from wallmirror.derendering.problem import Problem, reduced_misfit
 from wallmirror.derendering.subspace import SignalSpace

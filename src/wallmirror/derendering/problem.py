@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.facets import Factor, weighted
+from wallmirror.derendering.nested import FINEST_QUADRATURE, NOISY_STEPS, Nested
 from wallmirror.derendering.span import Span
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, noise_edge, signal_space
@@ -32,8 +33,8 @@ _SILENT, _DROWNED = 1e-32, 1e60
 # Standard deviations above which a radiance stands out of its noise; those that, over the brightest such, say as much as
 # infinite ones.
 _CLEAR, _DEAF = 5.0, 1e6
-# Knot spacings in degrees of the BRDFs into whose span noisy captures are projected, each half of the one before.
-_PROJECTION_STEPS = (4.0, 2.0, 1.0)
+# The finest knots of a BRDF into whose span noisy captures are projected, among those of the fit.
+_FINEST_SPAN = NOISY_STEPS.index(1.0)
 # Noise below this share of the films is none that a projection could be sure of taking away.
 _ROUNDING = 1e-6
 
@@ -64,6 +65,9 @@ class Problem:
     scale: float
     exponents: dict[Factor, float] = field(default_factory=dict)
     _kernels: dict[tuple[int, int], Kernel] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _nested: dict[tuple[tuple[float, ...], float], Nested] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @property
     def card(self) -> Card:
@@ -120,6 +124,15 @@ class Problem:
             self._kernels.clear()
             self._kernels[orders] = build_kernel(observer, card, weights=weights, orders=orders)
         return weighted(self._kernels[orders], self.exponents)
+
+    def nested(self, steps: tuple[float, ...], quadrature: float, *, keep: bool = False) -> Nested:
+        """Nested grids of these knot spacings in degrees; kept ones are handed over to whom asks for the same next."""
+        found = self._nested.pop((steps, quadrature), None)
+        if found is None:
+            found = Nested.of(self.data, self.inverse_variance, self.kernel, steps, quadrature)
+        if keep:
+            self._nested[steps, quadrature] = found
+        return found
 
     def designs(self, step_deg: float, *, degree: int, tolerance: float) -> tuple[SplineGrid, list[sp.csr_array]]:
         """The spline grid of one knot spacing and the transport over it, with quadrature to match."""
@@ -276,27 +289,29 @@ def _signal_space(problem: Problem, *, weak_patterns: bool) -> SignalSpace:
         return space
     certain = floor < _ROUNDING * space.singular_values[0]
     if not certain:
-        kernel = problem.kernel(_PROJECTION_STEPS[-1], 1e-4)
-        grids = [grid_for(kernel, step=math.radians(_PROJECTION_STEPS[0]), degree=3)]
-        for _ in _PROJECTION_STEPS[1:]:
-            grids.append(grids[-1].halved())
-        span = Span.of(problem.weighted_data, problem.weighted(design_matrices(kernel, grids[-1])))
         # Where patterns drown in the films, the finest BRDF grid in whose span they stand out is taken.
-        best = None
-        for grid in reversed(grids):
-            if grid is not grids[-1]:
-                span = span.coarser(grid.in_halved())
+        nested, best = _nested_for_spans(problem), None
+        for index in range(_FINEST_SPAN, -1, -1):
+            span = Span.of(nested.moments(index), problem.data.shape[0])
             within = span.projected(elements, noise=1.0 if problem.noise_is_stated else None)
-            if within.rank > (space if best is None else best).rank:
-                best = within
+            if within.rank > (space if best is None else best[1]).rank:
+                best = index, within
             if within.rank == elements:
                 break
-        space = space if best is None else best.space()
+        if best is not None:
+            space = best[1].space(nested.designs(best[0]), problem.row_weights)
         if space.rank == elements:
             return space
     if certain or not weak_patterns:
         raise too_few_patterns(space.rank, elements)
     return space
+
+
+def _nested_for_spans(problem: Problem) -> Nested:
+    """Nested grids whose moments have one weight for all realisations: those of the fit, where these share theirs."""
+    if problem.fit_weights.shape[1] == 1:
+        return problem.nested(NOISY_STEPS, FINEST_QUADRATURE, keep=True)
+    return Nested.of(problem.data, np.square(problem.row_weights), problem.kernel, NOISY_STEPS, FINEST_QUADRATURE)
 
 
 def expected_mismatch(problem: Problem, space: SignalSpace, closed: ClosedForm) -> float:

@@ -25,7 +25,7 @@ from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.exact import solve_exactly
 from wallmirror.derendering.facet_fit import WallModel, settle_wall
 from wallmirror.derendering.gauge import Gauge, Scale
-from wallmirror.derendering.knots import NOISY_STEPS
+from wallmirror.derendering.nested import NOISY_STEPS
 from wallmirror.derendering.noisy import solve_noisy
 from wallmirror.derendering.one_bounce import check_one_bounce
 from wallmirror.derendering.options import Method, require_options, require_wall

@@ -21,10 +21,9 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from wallmirror.derendering.moments import Pairs
+from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.subspace import SignalSpace, noise_edge
-from wallmirror.derendering.windows import Windows
-from wallmirror.memory import pairs_bytes, require_memory, span_bytes
+from wallmirror.memory import require_memory, span_bytes
 
 Array = NDArray[np.float64]
 
@@ -38,51 +37,32 @@ _ROUNDING = 1e-7
 
 @dataclass(frozen=True)
 class Span:
-    """The columns S = [T_1 .. T_M] and what the projection needs of them and of the films.
+    """What the projection onto the columns S = [T_1 .. T_M], n = M K of them, needs of them and of the films.
 
     Parameters
     ----------
-    designs:
-        T_1 .. T_M of the finest knots, each sparse (P, K), n = M K columns in all.
-    prolongation:
-        R, sparse (n, n'), where coarser knots have taken their place: theirs are S R.
+    rows:
+        P.
     gram, right:
-        (S R)^T S R, sparse (n', n'), and (S R)^T D, shape (n', B).
+        S^T S, sparse (n, n), and S^T D, shape (n, B), of rows weighted so that the noise of all is alike.
     energy:
         sum D^2.
     """
 
-    designs: list[sp.csr_array]
-    prolongation: sp.csr_array
+    rows: int
     gram: sp.csr_array
     right: Array
     energy: float
 
     @classmethod
-    def of(cls, data: Array, designs: list[sp.csr_array]) -> Span:
-        """From D (P, B) and T_1 .. T_M (P, K), rows weighted so that the noise of all is alike; InputError where too large."""
-        windows = Windows.of(designs)
-        if windows is not None:
-            most = windows.most_entries()
-            require_memory(
-                pairs_bytes(most, 1) + span_bytes(2 * most),
-                f"the span of {len(designs)} elements on {designs[0].shape[1]} knots",
-            )
-        gram = Pairs.of(designs, windows, np.ones(data.shape[0])).whole()
-        itself = sp.eye_array(gram.shape[0], format="csr")
-        right = np.concatenate([t.T @ data for t in designs])
-        return cls(designs, itself, gram, right, float(np.sum(data * data)))
-
-    def coarser(self, halved: sp.csr_array) -> Span:
-        """That of knots twice as far apart, whose r is `halved` r on these knots, (K, K'); see `SplineGrid.in_halved`."""
-        every = sp.block_diag([halved] * len(self.designs), format="csr")
-        gram = sp.csr_array(every.T @ self.gram @ every)
-        return Span(self.designs, self.prolongation @ every, gram, every.T @ self.right, self.energy)
-
-    def films(self, coefficients: Array) -> Array:
-        """S R x for x of shape (n', m), (P, m)."""
-        parts = np.split(self.prolongation @ coefficients, len(self.designs))
-        return np.asarray(sum(t @ part for t, part in zip(self.designs, parts, strict=True)), dtype=np.float64)
+    def of(cls, summed: Moments, rows: int) -> Span:
+        """From the moments of P rows of films whose realisations share their weights; InputError where it is too large."""
+        (pairs,) = summed.pairs
+        require_memory(
+            span_bytes(2 * pairs.above.nnz), f"the span of {summed.elements} elements on {summed.size} knots"
+        )
+        right = summed.cross.transpose(1, 2, 0).reshape(summed.elements * summed.size, -1)
+        return cls(rows, pairs.whole(), right, float(np.sum(summed.energy)))
 
     def projected(self, elements: int, *, noise: float | None) -> Projected:
         """The films' projection.
@@ -97,13 +77,13 @@ class Span:
         basis = _Basis.of(self.gram)
         projected = basis.projected(self.right)
         left, singular, _ = np.linalg.svd(projected, full_matrices=False)
-        rows, dimensions = self.designs[0].shape[0], projected.shape[0]
+        dimensions = projected.shape[0]
         if noise is None:
             rest = max(0.0, self.energy - float(np.sum(projected * projected)))
-            noise = math.sqrt(rest / max(1, (rows - dimensions) * self.right.shape[1]))
+            noise = math.sqrt(rest / max(1, (self.rows - dimensions) * self.right.shape[1]))
         floor = noise * noise_edge(dimensions, self.right.shape[1])
         rank = int(np.count_nonzero(singular[:elements] > max(_ROUNDING * singular[0], floor)))
-        return Projected(self, basis, left[:, :elements], singular, rank, dimensions)
+        return Projected(basis, left[:, :elements], singular, rank, dimensions)
 
 
 @dataclass(frozen=True)
@@ -118,17 +98,17 @@ class Projected:
         As those of a `SignalSpace`.
     """
 
-    span: Span
     basis: _Basis
     left: Array
     singular_values: Array
     rank: int
     dimensions: int
 
-    def space(self) -> SignalSpace:
-        """U itself, which takes a pass over the pixels."""
-        basis = self.span.films(self.basis.combined(self.left))
-        return SignalSpace(basis, self.singular_values, self.rank, self.dimensions)
+    def space(self, designs: list[sp.csr_array], row_weights: Array) -> SignalSpace:
+        """U itself, by a pass over the pixels: from T_1 .. T_M (P, K) and what their rows are weighted with, (P, 1)."""
+        parts = np.split(self.basis.combined(self.left), len(designs))
+        films = sum(t @ part for t, part in zip(designs, parts, strict=True))
+        return SignalSpace(row_weights * films, self.singular_values, self.rank, self.dimensions)
 
 
 @dataclass(frozen=True)

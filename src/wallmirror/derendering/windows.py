@@ -83,18 +83,24 @@ class Windows:
     def most_entries(self) -> int:
         """Entries that `grams` will find at most, without a look at a value: rows of N_ij reach as far as the windows of j do
         where those of i cover the row."""
-        width, elements = self.blocks.shape[3], self.begin.shape[1]
-        total = 0
+        elements, total = self.begin.shape[1], 0
         for i in range(elements):
-            low = np.full((self.size, elements - i), self.size)
-            high = np.full((self.size, elements - i), -1)
-            np.minimum.at(low, self.begin[:, i], self.begin[:, i:])
-            np.maximum.at(high, self.begin[:, i], self.begin[:, i:])
-            # A row lies in windows that begin up to a width before it.
-            low = minimum_filter1d(low, width, axis=0, origin=(width - 1) // 2, mode="constant", cval=self.size)
-            high = maximum_filter1d(high, width, axis=0, origin=(width - 1) // 2, mode="constant", cval=-1)
-            total += int(np.sum((high - low + width)[high >= low]))
+            low, high = self._reach(i)
+            total += int(np.sum(np.maximum(high - low, 0)))
         return total
+
+    def _reach(self, i: int) -> tuple[Indices, Indices]:
+        """First column, and the one after the last, that windows of elements i, i + 1, .. reach to in each row of N_ij, shape
+        (K, M - i): where those of i cover the row; K and 0 where none does."""
+        width, begin = self.blocks.shape[3], self.begin
+        low = np.full((self.size, begin.shape[1] - i), self.size)
+        high = np.zeros_like(low)
+        np.minimum.at(low, begin[:, i], begin[:, i:])
+        np.maximum.at(high, begin[:, i], begin[:, i:] + width)
+        # A row lies in windows that begin up to a width before it.
+        low = minimum_filter1d(low, width, axis=0, origin=(width - 1) // 2, mode="constant", cval=self.size)
+        high = maximum_filter1d(high, width, axis=0, origin=(width - 1) // 2, mode="constant", cval=0)
+        return low, high
 
     def grams(self, weight: Array) -> tuple[NDArray[np.intp], Indices, Array]:
         """N_ij = T_i^T W T_j for i <= j, in the order (0, 0), (0, 1), ..., (0, M - 1), (1, 1), ...
@@ -120,17 +126,11 @@ class Windows:
             np.matmul(left.transpose(0, 2, 1), right, out=product.reshape(count, width, -1))
             # Rows of N_ij reach from `low` up to `high`: one such stretch after the other, a small table sums the blocks up.
             row = (self.begin[:, i, None] + ahead)[:, :, None] + self.size * np.arange(elements - i)
-            begin = np.broadcast_to(self.begin[:, None, i:], row.shape)
-            low, high = (
-                np.full(self.size * (elements - i), self.size),
-                np.zeros(self.size * (elements - i), dtype=np.intp),
-            )
-            np.minimum.at(low, row.ravel(), begin.ravel())
-            np.maximum.at(high, row.ravel(), begin.ravel() + width)
+            low, high = (reach.T.ravel() for reach in self._reach(i))
             reach = np.maximum(high - low, 0)
             end = np.cumsum(reach)
             shift = end - reach - low
-            np.add((shift[row] + begin)[..., None], ahead, out=place.reshape(*row.shape, width))
+            np.add((shift[row] + self.begin[:, None, i:])[..., None], ahead, out=place.reshape(*row.shape, width))
             table = np.bincount(place, weights=product, minlength=int(end[-1]))
             filled = np.flatnonzero(table)
             of_row = np.diff(np.searchsorted(filled, end), prepend=0)
