@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from wallmirror.brdf import AngleSumBRDF, Diffuse, GaussianTrain, Sum
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.borrowed import borrowed_share
-from wallmirror.derendering.bounds import cramer_rao
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.groups import one_group
-from wallmirror.derendering.information import information
+from wallmirror.derendering.knots import Level
+from wallmirror.derendering.likelihood import Fit
 from wallmirror.derendering.moments import moments
 from wallmirror.derendering.problem import prepare
 from wallmirror.derendering.solve import solve
+from wallmirror.derendering.subspace import closed_form
 from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card, Observer, scan_angles
 from wallmirror.transport import Weights, radiance, transport_matrix
@@ -85,7 +86,7 @@ def test_what_the_noise_in_the_wall_alone_tells_is_not_called_good(
             assert "noise in the BRDF" in str(refusal)  # noqa: PT017
         # The planted fault: without the test, bars of some per cent are believed, whatever the noise.
         with monkeypatch.context() as planted:
-            planted.setattr("wallmirror.derendering.patterns.borrowed_share", lambda *_, **__: 0.0)
+            planted.setattr("wallmirror.derendering.borrowed.borrowed_share", lambda *_: 0.0)
             believed = solve(captures, step_deg=step_deg)
         assert believed.predicted_error < 0.32
         z.append(scale_free_error(believed.source, source) / believed.predicted_error)
@@ -97,19 +98,19 @@ def test_what_noise_adds_is_foretold() -> None:
     """Against the average over noises in r of the square of J that a least-squares fit of r and V leaves, by full matrices."""
     observer, card, brdf = thesis_observer(60, 3), thesis_card(3), lobes(sigma_deg=8.0)
     captures, source = filmed(observer, card, brdf, 6, 15.0, weights="cosine")
-    problem, _ = prepare(captures, weak_patterns=True)
+    problem, space = prepare(captures, weak_patterns=True)
     grid, designs = problem.designs(4.0, degree=3, tolerance=1e-7)
     summed = moments(problem.data, designs, problem.inverse_variance)
     v, r = source / problem.scale, grid.interpolate(brdf.of_sum)
-    known = information(summed, r, v)
-    bound = cramer_rao(summed, r, v, gauge=grid.row(grid.peak(r, summed.exposure)))
+    closed = closed_form(problem.weighted_data, problem.weighted(designs), space)
+    truth = Fit(r, v, objective=math.nan, iterations=0, converged=True)
+    level = Level(grid, designs, summed, closed, free=truth, fit=truth, groups=one_group(designs), strained=False)
+    known, bound = level.information, level.bound
     transport = np.stack([t @ r for t in designs], axis=1)
     with pytest.MonkeyPatch.context() as whole:  # as where it matters
         whole.setattr("wallmirror.derendering.borrowed._MATTERS", 0.0)
         whole.setattr("wallmirror.derendering.borrowed._CARRYING", r.size)
-        share = borrowed_share(
-            problem, designs, summed, known, bound, transport, v, sigma=1.0, groups=one_group(designs)
-        )
+        share = borrowed_share(problem, level, sigma=1.0)
     # The worst direction as the leading eigenvector of the covariance of V, freed of the scale.
     spread = known.coupled.reshape(-1, bound.coefficients.shape[0])
     unit = v.T.ravel() / np.linalg.norm(v)

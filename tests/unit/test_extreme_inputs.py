@@ -413,6 +413,6 @@ def test_the_command_line_cells_catch_a_file_left_behind_and_a_traceback(monkeyp
         raise ValueError("planted")
 
     monkeypatch.setattr(counting, "prepare_counts", crash)
-    monkeypatch.setattr("wallmirror.derendering.solve.prepare_counts", crash)
+    monkeypatch.setattr("wallmirror.derendering.stages.prepare_counts", crash)
     with pytest.raises(ValueError, match="planted"):
         commands.refused_well(["solve", "set", "-o", "out", "--method", "poisson", "--counts", "1e6"])

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from wallmirror.brdf import Diffuse, GaussianTrain, Sum
@@ -23,7 +24,7 @@ from wallmirror.derendering.splines import design_matrices, grid_for
 from wallmirror.geometry import Card
 from wallmirror.transport import build_kernel, radiance, transport_matrix
 
-from .helpers import assert_undetermined, thesis_observer
+from .helpers import EPS, assert_undetermined, thesis_observer
 
 Array = NDArray[np.float64]
 
@@ -81,6 +82,23 @@ def test_each_group_lies_within_its_bars_and_one_scale_for_both_does_not() -> No
     # three directions of each draw that matter: three standard errors are 3 sqrt(2 / 3 / 24) = 0.5.
     assert abs(np.mean(squares) - 1) < 0.5
     assert abs(np.mean(np.square(ratios)) - 1) < 0.5
+
+
+def test_a_scale_of_any_group_is_freed_away_whole_and_nothing_else() -> None:
+    rng = np.random.default_rng(0)
+    groups = Groups(GROUPS, np.ones((2, 1), dtype=bool))
+    source, change = rng.random((2, 5, 10))
+    free = groups.freed(change, source)
+    # Sums of thirty products of order one are off by less than a hundred roundings.
+    np.testing.assert_allclose(np.sum(groups.patterns(source) * free.T, axis=(1, 2)), 0.0, rtol=0, atol=100 * EPS)
+    scaled = change + np.repeat([0.3, -2.0], [3, 2])[:, None] * source
+    np.testing.assert_allclose(groups.freed(scaled, source), free, rtol=0, atol=100 * EPS)
+    # The twin: freed of one scale for both, a change of one of them is still there.
+    both = one_group([sp.csr_array((1, 1))] * 5)
+    assert np.linalg.norm(both.freed(scaled, source) - both.freed(change, source)) > 1
+    # A dark group has no pattern to be freed of.
+    source[3:] = 0.0
+    np.testing.assert_array_equal(groups.freed(change, source)[3:], change[3:])
 
 
 def test_one_scale_for_both_groups_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:

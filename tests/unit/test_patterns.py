@@ -61,6 +61,7 @@ def weakest(source: Array, seed: int, monkeypatch: pytest.MonkeyPatch, noise: fl
         return bound, ()
 
     monkeypatch.setattr(noisy, "trusted_bound", spy)
+    monkeypatch.setattr(noisy, "doubts_of_borrowing", lambda *_: ())
     films = captures(source, noise, seed)
     solution = fitted(films)
     assert films.variance is not None

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from wallmirror.brdf import CookTorrance, Fresnel
 from wallmirror.captures import CaptureSet
-from wallmirror.derendering import scarce
+from wallmirror.derendering import scarce, stages
 from wallmirror.derendering.few_captures import FewCaptures, few_captures
 from wallmirror.derendering.problem import prepare
 from wallmirror.derendering.rivals import LEVEL, better_by_chance
@@ -26,8 +26,7 @@ from .helpers import assert_undetermined, up_to_scale
 
 Array = NDArray[np.float64]
 
-# The modules, whose functions have their names.
-solving = importlib.import_module("wallmirror.derendering.solve")
+# The module, whose function has its name.
 searching = importlib.import_module("wallmirror.derendering.few_captures")
 
 # Held to the angle sum, a pattern 85 % off explains the films of this wall of facets five times better than the true one.
@@ -69,7 +68,7 @@ def test_a_far_pattern_that_facets_would_make_as_good_is_told(wall: Any, monkeyp
     assert off(told) > 50
     assert told.verdict == "doubtful"
     assert any("were the wall one of facets, a pattern that differs by" in warning for warning in told.warnings)
-    monkeypatch.setattr(solving, "hold_against_rivals", only_the_answer)
+    monkeypatch.setattr(stages, "hold_against_rivals", only_the_answer)
     assert solve(captures, wall=wall, step_deg=2.0).verdict == "good"  # 50 error bars off
 
 
@@ -84,7 +83,7 @@ def test_a_pattern_that_facets_make_better_takes_over(seed: int, monkeypatch: py
     assert found.angle_sum_check.assumed
     # Where the wall is held to the angle sum the same films are doubted.
     assert solve(captures, wall="angle_sum", step_deg=2.0).verdict == "doubtful"
-    monkeypatch.setattr(solving, "hold_against_rivals", only_the_answer)
+    monkeypatch.setattr(stages, "hold_against_rivals", only_the_answer)
     assert off(solve(captures, step_deg=2.0)) > 50
 
 
@@ -92,7 +91,7 @@ def test_facets_fitted_next_to_a_pattern_that_does_not_suit_them_best_are_refuse
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     captures = films(6, 55)
-    whole = solving.solve_scarce
+    whole = stages.solve_scarce
 
     def elsewhere(problem: Any, **options: Any) -> Any:
         """The search on the fitted wall ends at another pattern: one bright element."""
@@ -101,7 +100,7 @@ def test_facets_fitted_next_to_a_pattern_that_does_not_suit_them_best_are_refuse
         one[0] = 1.0
         return (replace(estimate, source=one) if problem.exponents else estimate), others
 
-    monkeypatch.setattr(solving, "solve_scarce", elsewhere)
+    monkeypatch.setattr(stages, "solve_scarce", elsewhere)
     assert "a wall of facets was fitted next to a pattern" in assert_undetermined(lambda: solve(captures, step_deg=2.0))
 
 

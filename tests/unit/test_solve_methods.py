@@ -563,7 +563,7 @@ def test_a_rival_brdf_that_fits_nearly_as_well_is_told(views: int, monkeypatch: 
     if views == 4:
         # There the noise in the BRDF makes what seems to be known, which another test finds; this one must do without it.
         assert_undetermined(lambda: solve(captures))
-        monkeypatch.setattr("wallmirror.derendering.patterns.borrowed_share", lambda *_, **__: 0.0)
+        monkeypatch.setattr("wallmirror.derendering.borrowed.borrowed_share", lambda *_: 0.0)
     solution = solve(captures)
     # The twin: a camera that turns further, and looks more often, leaves no rival.
     assert any("another BRDF" in warning for warning in solution.warnings) == (views == 4)

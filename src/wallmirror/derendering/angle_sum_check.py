@@ -173,8 +173,8 @@ def _derivatives(
     # The gauge keeps r off the null direction of each scale; the ridge is for barely seen cells.
     groups = groups_of(designs) if estimate.groups else one_group(designs)
     schur = known.schur.copy()
-    for mine in groups.cells:
-        part = np.where(mine, r, 0.0)[cells]
+    for own in groups.parts(r):
+        part = own[cells]
         schur += level * np.outer(part, part) / max(float(part @ part), 1e-300)
     schur[np.diag_indices_from(schur)] += _RIDGE * level
     if kernel.weight.shape[-1] == 1:  # what a pixel's only node sends is F
@@ -198,10 +198,7 @@ def _derivatives(
         dv = (np.einsum("bij,bj->bi", known.inverse, along) - np.einsum("bmk,k->bm", known.coupled, dr[cells])).T
         moved = np.stack([t @ dr for t in designs], axis=1)
         unexplained.append((change - moved) @ source - estimate.transport @ dv)
-        for elements in map(list, groups.elements):  # a change of scale is no turn
-            own = source[elements]
-            dv[elements] -= own * (np.sum(dv[elements] * own) / np.sum(own**2))
-        turns.append(-dv)
+        turns.append(-groups.freed(dv, source))  # a change of scale is no turn
     return unexplained, turns
 
 

@@ -16,101 +16,93 @@ noise there is. Where such borrowed information is as much as the own, the Crame
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from wallmirror.derendering.bounds import Bound
-from wallmirror.derendering.groups import Groups
-from wallmirror.derendering.information import Information
-from wallmirror.derendering.moments import Moments
+from wallmirror.derendering.knots import Level
 from wallmirror.derendering.problem import Problem
+from wallmirror.errors import UndeterminedError
 
 Array = NDArray[np.float64]
 
+# A share of borrowed information of a third makes bars a fifth too small. And bars below which none lies behind them, as noise
+# in the few hundred numbers that r has makes bars of per cents, whatever its strength.
+_THIRD, _TELLING = 1 / 3, 3e-3
 # Steps of the power iteration towards the worst-known direction: it need not be found well, for all bad ones borrow.
 _STEPS = 8
 # Directions of the noise in r of which what other r and V make is taken off, where it may matter: few carry nearly all.
 _CARRYING = 12
 _MATTERS = 0.25
+_BORROWED = (
+    "a third or more of what the captures seem to tell of the worst-known side of the pattern is the noise in the BRDF that "
+    "was found, so its error bars are too small; use views or a card whose reflections share more angles"
+)
 
 
-def borrowed_share(
-    problem: Problem,
-    designs: list[sp.csr_array],
-    summed: Moments,
-    known: Information,
-    bound: Bound,
-    transport: Array,
-    source: Array,
-    *,
-    sigma: float,
-    groups: Groups,
-) -> float:
-    """What noise adds to the information along the worst-known direction of V, over all that is found there.
+def doubts_of_borrowing(problem: Problem, level: Level, sigma: float) -> tuple[str, ...]:
+    """What has to be said of a fit whose knowledge of some direction of V is in part the noise in r.
 
     Parameters
     ----------
-    designs, summed:
-        T_1 .. T_M (P, K), and the moments of the films on them.
-    known, bound:
-        The information at (r, V), and the bound that it gives.
-    transport, source:
-        F (P, M) and V (M, B).
     sigma:
         Standard deviation of the noise in units of the weights.
+
+    Raises
+    ------
+    UndeterminedError
+        If all that seems to be known of some direction of V is borrowed.
     """
-    elements, realisations = source.shape
-    coupled, covariance = known.coupled.reshape(realisations * elements, -1), bound.coefficients
-    scales = groups.patterns(source).reshape(len(groups), -1)
-    scales /= np.maximum(np.linalg.norm(scales, axis=1, keepdims=True), 1e-300)
-    dr, variance = np.random.default_rng(0).standard_normal(coupled.shape[1]), 0.0
+    if sigma * level.bound.source_error <= _TELLING:
+        return ()
+    share = borrowed_share(problem, level, sigma)
+    if share >= 1:
+        raise UndeterminedError(
+            "what the captures seem to tell of the pattern is the noise in the BRDF that was found: of a wall without that "
+            "noise they would not tell it; use views or a card whose reflections share more angles"
+        )
+    return (_BORROWED,) if share > _THIRD else ()
+
+
+def borrowed_share(problem: Problem, level: Level, sigma: float) -> float:
+    """What noise of standard deviation sigma adds to the information along the worst-known direction of V, over all there."""
+    known, covariance = level.information, level.bound.coefficients
+    dr, variance = np.random.default_rng(0).standard_normal(len(covariance)), 0.0
     for _ in range(_STEPS):
         before = dr / max(float(np.linalg.norm(dr)), 1e-300)
-        dr = covariance @ (coupled.T @ _freed(coupled @ before, scales))
+        dr = covariance @ np.tensordot(_following(level, before).T, known.coupled, axes=2)
         variance = float(before @ dr)
-    dv = _freed(coupled @ dr, scales)
+    dv = _following(level, dr)
     if not (variance > 0 and np.any(dv)):
         return 0.0
-    own = float(dv @ dv) / variance
-    dv = dv.reshape(realisations, elements)
-    beside = summed.gram_of_source(dv)[np.ix_(known.seen, known.seen)]
+    own = float(np.sum(dv * dv)) / variance
+    beside = level.summed.gram_of_source(dv.T)[np.ix_(known.seen, known.seen)]
     unit = sigma**2 / own
     share = float(unit * np.sum(beside * covariance))
     if share < _MATTERS:
         return share
     # Noise in r by direction, the one that adds most first; of the first few what other r and V make of it is taken off.
-    level, turned = np.linalg.eigh(covariance)
-    root = turned * np.sqrt(np.maximum(level, 0.0))
+    values, turned = np.linalg.eigh(covariance)
+    root = turned * np.sqrt(np.maximum(values, 0.0))
     adds, mixed = np.linalg.eigh(root.T @ beside @ root)
     noises = (root @ mixed[:, ::-1])[:, :_CARRYING].T
     rest = float(np.sum(adds[: max(0, adds.size - _CARRYING)]))
-    return unit * (
-        rest + sum(_beyond(problem, designs, known, covariance, transport, source, noise, dv) for noise in noises)
-    )
+    transport = np.stack([t @ level.fit.coefficients for t in level.designs], axis=1)
+    return unit * (rest + sum(_beyond(problem, level, transport, noise, dv) for noise in noises))
 
 
-def _freed(dv: Array, scales: Array) -> Array:
-    """dV (B M,) without its parts along the scales, (G, B M) of unit length."""
-    return np.asarray(dv - scales.T @ (scales @ dv))
+def _following(level: Level, dr: Array) -> Array:
+    """-dV (M, B), without the scales, by which the best V follows a change dr (K',) of the seen coefficients."""
+    return level.groups.freed(np.tensordot(level.information.coupled, dr, axes=1).T, level.fit.source)
 
 
-def _beyond(
-    problem: Problem,
-    designs: list[sp.csr_array],
-    known: Information,
-    covariance: Array,
-    transport: Array,
-    source: Array,
-    noise: Array,
-    dv: Array,
-) -> float:
+def _beyond(problem: Problem, level: Level, transport: Array, noise: Array, dv: Array) -> float:
     """The square of sum_i T_i dr dV_i for a noise dr in r, in units of the weights, that no change of r and V makes."""
+    known, designs = level.information, level.designs
     whole = np.zeros(known.seen.size)
     whole[known.seen] = noise
-    films = np.stack([t @ whole for t in designs], axis=1) @ dv.T
+    films = np.stack([t @ whole for t in designs], axis=1) @ dv
     weighted = problem.fit_weights * films
     by_v = transport.T @ weighted  # F^T W b of each realisation
     made = np.einsum("bij,jb->ib", known.inverse, by_v)
-    by_r = sum(t.T @ (weighted @ v) for t, v in zip(designs, source, strict=True))[known.seen]
+    by_r = sum(t.T @ (weighted @ v) for t, v in zip(designs, level.fit.source, strict=True))[known.seen]
     by_r -= np.einsum("bik,ib->k", known.coupled, by_v)
-    return max(0.0, float(np.sum(weighted * films) - np.sum(by_v * made) - by_r @ covariance @ by_r))
+    return max(0.0, float(np.sum(weighted * films) - np.sum(by_v * made) - by_r @ level.bound.coefficients @ by_r))

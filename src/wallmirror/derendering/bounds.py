@@ -122,7 +122,7 @@ def bound_of(
     schur, inverse, coupled, seen = known.schur, known.inverse, known.coupled, known.seen
     c, r = np.atleast_2d(gauge)[:, seen], coefficients[seen]
     # A null direction of S for each scale that is free: the group's part of r.
-    null = r[None] if groups is None else np.where(groups.cells[:, seen], r, 0.0)
+    null = r[None] if groups is None else groups.parts(coefficients)[:, seen]
     patterns = source.T[None] if groups is None else groups.patterns(source)
     # Where rounding is all there is, the trace may be negative.
     level = float(np.trace(schur)) / max(1, schur.shape[0])

@@ -42,7 +42,7 @@ Parameter = Literal["x", "y", "width"]
 
 _NAMES: tuple[Parameter, ...] = get_args(Parameter)
 _WORDS = {"x": "offset", "y": "distance", "width": "width"}
-# As in `solve`: below this mismatch there is no noise.
+# As in `stages`: below this mismatch there is no noise.
 _NOISELESS = 1e-15
 # A standard deviation of this share of the distance (or of the width) means that the captures know nothing of it.
 _UNTOLD = 0.3

@@ -27,7 +27,7 @@ _LATTICE = 0.2
 _MAX_LATTICE = 12
 # A mismatch that calls for another search, unless the noise makes it.
 _UNEXPLAINED = 0.01
-# As in `solve`: at this mismatch rounding is all that is left.
+# As in `exact`: at this mismatch rounding is all that is left.
 _ROUNDING = 3e-23
 _LOST = 1e-13
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet
+from wallmirror.derendering.borrowed import doubts_of_borrowing
 from wallmirror.derendering.bounds import Bound
 from wallmirror.derendering.estimate import Estimate, doubts_of_fit
 from wallmirror.derendering.knots import refine
@@ -114,7 +115,8 @@ def solve_counts(
     bound, doubts = trusted_bound(
         problem, level, transport, source, sigma=sigma, bound=bound_at(source), bound_at=bound_at
     )
-    warnings = [*doubts, *doubts_of_fit(converged=fit.converged, misfit=None)]
+    borrowed = doubts_of_borrowing(problem, level, sigma)
+    warnings = [*doubts, *borrowed, *doubts_of_fit(converged=fit.converged, misfit=None)]
     if fit.chi_squared > 1.2:
         warnings.append(
             f"the counts scatter {fit.chi_squared:.2f} times as much as counting alone, so the model or the counts per "

@@ -46,13 +46,22 @@ class Groups:
             part[:, mine] = source[mine].T
         return parts
 
+    def freed(self, change: Array, source: Array) -> Array:
+        """dV (M, B) without what a scale of each group makes of V (M, B): its part along the group's pattern."""
+        free = np.copy(change)
+        for mine in map(list, self.elements):
+            own = source[mine]
+            free[mine] -= own * (np.sum(free[mine] * own) / max(float(np.sum(own**2)), 1e-300))
+        return free
+
+    def parts(self, coefficients: Array) -> Array:
+        """r (K,), or what goes with it, of each group alone, (G, K); those of r are the null directions of S."""
+        return np.where(self.cells, coefficients, 0.0)
+
     def gauges(self, grid: SplineGrid, coefficients: Array, exposure: Array) -> Array:
         """c of each group, (G, K): the basis functions where the well-seen part of its rho is largest."""
-        places = []
-        for mine in self.cells:
-            seen = np.where(mine, exposure, 0.0)
-            places.append(grid.peak(np.where(mine, coefficients, 0.0), seen / np.max(seen)))
-        return np.stack([grid.row(at) for at in places])
+        each = zip(self.parts(coefficients), self.parts(exposure), strict=True)
+        return np.stack([grid.row(grid.peak(part, seen / np.max(seen))) for part, seen in each])
 
     def scaled(self, fit: Fit, grid: SplineGrid, exposure: Array) -> Fit:
         """The same fit with every group's pattern positive in sum and its rho 1 at its gauge."""

@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from wallmirror.derendering.borrowed import doubts_of_borrowing
 from wallmirror.derendering.components import in_words
 from wallmirror.derendering.estimate import Estimate, doubts_of_fit, scale_free_error
 from wallmirror.derendering.knots import Refined, refine
@@ -64,6 +65,7 @@ def solve_noisy(
     bound, doubts = trusted_bound(
         problem, level, transport, fit.source, sigma=sigma, bound=level.bound, bound_at=level.bound_at
     )
+    borrowed = doubts_of_borrowing(problem, level, sigma)
     predicted = sigma * bound.source_error
     shape_std = sigma * bound.shape_std
     warnings: list[str] = []
@@ -99,7 +101,7 @@ def solve_noisy(
             )
     if apart:
         warnings.append(in_words(apart))
-    warnings += doubts
+    warnings += [*doubts, *borrowed]
     return Estimate(
         method="maximum_likelihood",
         grid=grid,

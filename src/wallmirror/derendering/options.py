@@ -29,6 +29,12 @@ class SolveOptions(TypedDict, total=False):
     seed: int
 
 
+def require_tolerance(tolerance: float | None) -> None:
+    """Raise InputError unless this is a relative error, or none is asked for."""
+    if tolerance is not None and not 0 < tolerance < 1:
+        raise InputError(f"is {tolerance:g}; give a relative error between 0 and 1", field="tolerance")
+
+
 def require_wall(wall: str, scale: str) -> None:
     """Raise InputError unless this is a model of the wall, and one whose scale is settled so."""
     if wall not in get_args(WallModel):

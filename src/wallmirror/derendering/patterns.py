@@ -19,26 +19,17 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from wallmirror.derendering.borrowed import borrowed_share
 from wallmirror.derendering.bounds import Bound
 from wallmirror.derendering.knots import Level
 from wallmirror.derendering.problem import Problem, too_few_patterns
 from wallmirror.derendering.splines import exposures
 from wallmirror.derendering.subspace import CERTAIN, LIKELY, POSSIBLE, noise_edge
-from wallmirror.errors import UndeterminedError
 
 Array = NDArray[np.float64]
 
 # Standard deviation of a coefficient that the other elements leave it, as a share of the largest that a fit without bounds has,
 # from which it is free: beside a false pattern, which is faint, coefficients of its own grow large.
 _FREE = 0.3
-# A share of borrowed information of a third makes bars a fifth too small. And bars below which none lies behind them, as noise
-# in the few hundred numbers that r has makes bars of per cents, whatever its strength.
-_THIRD, _TELLING = 1 / 3, 3e-3
-_BORROWED = (
-    "a third or more of what the captures seem to tell of the worst-known side of the pattern is the noise in the BRDF that "
-    "was found, so its error bars are too small; use views or a card whose reflections share more angles"
-)
 _DOUBT = (
     "the faintest of the patterns is one that noise alone makes once in ten to a hundred times, so that one element fewer may "
     "be lit; the error bars do without it, and more light or more different patterns would tell"
@@ -73,40 +64,8 @@ def trusted_bound(
     Raises
     ------
     UndeterminedError
-        If a pattern is likely noise, or nothing is determined without one that may be, or what seems to be
-        known of some direction of V is borrowed from the noise in r (`borrowed`).
+        If a pattern is likely noise, or nothing is determined without one that may be.
     """
-    trusted, doubts = _of_certain_patterns(problem, level, transport, source, sigma, bound, bound_at)
-    if sigma * level.bound.source_error <= _TELLING:
-        return trusted, doubts
-    share = borrowed_share(
-        problem,
-        level.designs,
-        level.summed,
-        level.information,
-        level.bound,
-        np.stack([t @ level.fit.coefficients for t in level.designs], axis=1),
-        level.fit.source,
-        sigma=sigma,
-        groups=level.groups,
-    )
-    if share >= 1:
-        raise UndeterminedError(
-            "what the captures seem to tell of the pattern is the noise in the BRDF that was found: of a wall without that "
-            "noise they would not tell it; use views or a card whose reflections share more angles"
-        )
-    return trusted, (*doubts, _BORROWED) if share > _THIRD else doubts
-
-
-def _of_certain_patterns(
-    problem: Problem,
-    level: Level,
-    transport: Array,
-    source: Array,
-    sigma: float,
-    bound: Bound,
-    bound_at: Callable[[Array], Bound],
-) -> tuple[Bound, tuple[str, ...]]:
     elements = source.shape[0]
     triangle = np.linalg.qr(problem.row_weights * transport, mode="r")
     left, strength, right = np.linalg.svd(triangle @ source, full_matrices=False)
