@@ -39,11 +39,12 @@ SCENES = {
 
 def dense(windows: Windows, weight: Array, elements: int) -> list[Array]:
     """All N_ij for i <= j out of the windows' sums."""
-    entries, columns, values = windows.grams(weight)
-    rows = np.repeat(np.arange(entries.size), entries)
-    whole = np.zeros((entries.size, windows.size))
-    whole[rows, columns] = values
-    return list(whole.reshape(elements * (elements + 1) // 2, windows.size, windows.size))
+    whole, size = windows.grams(weight).toarray(), windows.size
+    pairs = range(elements * (elements + 1) // 2)
+    assert whole.shape == (len(pairs) * size, len(pairs) * size)
+    blocks = [whole[k * size : (k + 1) * size, k * size : (k + 1) * size] for k in pairs]
+    assert np.count_nonzero(whole) == sum(np.count_nonzero(block) for block in blocks)  # and none beside the diagonal
+    return blocks
 
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)

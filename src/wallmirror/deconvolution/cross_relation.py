@@ -18,12 +18,12 @@ from typing import Literal, get_args
 import numpy as np
 import scipy.linalg as sl
 from numpy.typing import ArrayLike, NDArray
-from threadpoolctl import threadpool_limits
 
 from wallmirror.arithmetic import rescaled
 from wallmirror.deconvolution.channels import checked_outputs
 from wallmirror.deconvolution.checking import real_samples
 from wallmirror.errors import InputError, UndeterminedError
+from wallmirror.threads import one_blas_thread
 
 Array = NDArray[np.float64]
 
@@ -111,7 +111,7 @@ def identify_channels(
         raise UndeterminedError(
             f"{rows} equations cannot determine {channels} channels of {taps} taps; give longer records or fewer taps"
         )
-    with threadpool_limits(limits=1, user_api="blas"):  # two threads that wait for each other are far slower
+    with one_blas_thread():
         if method == "cross_relation":
             matrix = _cross_relation_gram(g, taps)
         else:
@@ -147,7 +147,7 @@ def rival_channels(outputs: ArrayLike, taps: int) -> int:
     >>> rival_channels(g, 5), rival_channels(g, 7)
     (1, 3)
     """
-    with threadpool_limits(limits=1, user_api="blas"):  # two threads that wait for each other are far slower
+    with one_blas_thread():
         values = np.linalg.eigvalsh(_cross_relation_gram(_records(outputs, taps)[0], taps))
     best = max(float(values[0]), _ZERO * float(values[-1]))
     return max(1, int(np.count_nonzero(values <= best / _SEPARATED)))

@@ -19,13 +19,13 @@ import numpy as np
 import scipy.linalg as sl
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import irfft, next_fast_len, rfft
-from threadpoolctl import threadpool_limits
 
 from wallmirror.arithmetic import rescaled
 from wallmirror.deconvolution.channels import checked_outputs
 from wallmirror.deconvolution.checking import count
 from wallmirror.deconvolution.interferometry import pairs
 from wallmirror.errors import InputError
+from wallmirror.threads import one_blas_thread
 
 Array = NDArray[np.float64]
 
@@ -101,7 +101,7 @@ def fit_interferometric(
     if len(weights) == 0 or not all(w >= 0 for w in weights) or any(b > a for a, b in itertools.pairwise(weights)):
         raise InputError(f"is {tuple(weights)}; give weights >= 0 that fall", field="weights")
     history: list[float] = []
-    with threadpool_limits(limits=1, user_api="blas"):  # two threads that wait for each other are far slower
+    with one_blas_thread():
         problem = _Problem(g, taps)
         f_a = problem.start()
         for weight in weights:

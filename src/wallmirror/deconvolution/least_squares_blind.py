@@ -16,13 +16,13 @@ import numpy as np
 import scipy.linalg as sl
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import irfft, next_fast_len, rfft
-from threadpoolctl import threadpool_limits
 
 from wallmirror.arithmetic import rescaled
 from wallmirror.deconvolution.channels import checked_outputs
 from wallmirror.deconvolution.checking import in_unit, real_samples
 from wallmirror.deconvolution.levenberg import descend
 from wallmirror.errors import InputError
+from wallmirror.threads import one_blas_thread
 
 Array = NDArray[np.float64]
 
@@ -94,7 +94,7 @@ def least_squares_blind(outputs: ArrayLike, taps: int, *, start: ArrayLike, step
         )
     problem = _Problem(g, taps)
     target = 0.5 * (_ROUNDING**2) * float(np.sum(g * g))
-    with threadpool_limits(limits=1, user_api="blas"):  # two threads that wait for each other are far slower
+    with one_blas_thread():
         end = descend(
             problem.cost, problem.normal_equations, (h / np.linalg.norm(h)).ravel(), target=target, steps=steps
         )

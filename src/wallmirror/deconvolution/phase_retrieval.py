@@ -17,12 +17,12 @@ import numpy as np
 import scipy.linalg as sl
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import irfft, next_fast_len, rfft
-from threadpoolctl import threadpool_limits
 
 from wallmirror.deconvolution.checking import count, in_unit, real_samples
 from wallmirror.deconvolution.interferometry import pairs
 from wallmirror.deconvolution.levenberg import descend
 from wallmirror.errors import InputError, UndeterminedError
+from wallmirror.threads import one_blas_thread
 
 Array = NDArray[np.float64]
 
@@ -104,7 +104,7 @@ def retrieve_channels(
     x = problem.focused(nearest).ravel()
     power = float(np.sum(problem.table**2))
     taken = 0
-    with threadpool_limits(limits=1, user_api="blas"):  # two threads that wait for each other are far slower
+    with one_blas_thread():
         for weight in weights:
             problem.focus_on(nearest, weight)
             end = descend(problem.cost, problem.normal_equations, x, target=0.5e-30 * power, steps=steps)

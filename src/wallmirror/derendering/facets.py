@@ -43,7 +43,7 @@ _ROUGH = 0.4
 
 
 def _foreshortening(theta_s: Array, theta_o: Array) -> Array:
-    return np.asarray(-np.log(np.cos(theta_s)) - np.log(np.cos(theta_o)))
+    return np.asarray(-np.log(np.cos(theta_s) * np.cos(theta_o)))
 
 
 def _incidence(theta_s: Array, theta_o: Array) -> Array:

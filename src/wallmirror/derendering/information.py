@@ -160,9 +160,11 @@ def schur_complement(
         schur -= half.T @ half
     bound = np.flatnonzero(~whole)
     if bound.size:
-        coupling = _coupling(data, point)[bound][..., kept]
-        schur -= coupling.reshape(-1, cells.size).T @ (inverse[bound] @ coupling).reshape(-1, cells.size)
-        schur = 0.5 * (schur + schur.T)
+        # Of H_b^-1 = R R^T with rows of 0 the product R^T C_b does, which costs half.
+        values, vectors = np.linalg.eigh(inverse[bound])
+        root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+        half = (root.transpose(0, 2, 1) @ _coupling(data, point)[bound][..., kept]).reshape(-1, cells.size)
+        schur -= half.T @ half
     return schur
 
 

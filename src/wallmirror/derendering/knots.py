@@ -20,7 +20,7 @@ from wallmirror.derendering.finer import worth
 from wallmirror.derendering.groups import Groups
 from wallmirror.derendering.information import Information, information
 from wallmirror.derendering.ladder import SPARE, Ladder
-from wallmirror.derendering.likelihood import Fit, maximise
+from wallmirror.derendering.likelihood import Fit, finished
 from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.problem import Problem, expected_mismatch, too_few_patterns
 from wallmirror.derendering.splines import SplineGrid
@@ -39,6 +39,8 @@ _START = 1.0
 # How many times what noise would pay for the next finer knots' coefficients must be foretold of them for the coarser ones not
 # to be fitted first: those cost a quarter, and are the better start.
 _SURELY = 3.0
+# The same where rho >= 0 may leave all angles dark but for a few, in which finer knots need pay alone.
+_PERHAPS = 0.1
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,7 @@ def refine(
         If fewer patterns than elements stand out of the noise, or no knots are coarse enough to be determined.
     """
     ladder = Ladder.of(problem, space, steps, tolerance)
-    begin, start = _first_worth_a_fit(ladder)
+    begin, start = _first_worth_a_fit(ladder, nonnegative)
     while True:
         try:
             fits, rival = climb(ladder, begin, start, nonnegative, tolerance, tell)
@@ -163,7 +165,7 @@ def refine(
 def _level(ladder: Ladder, index: int, free: Fit, nonnegative: bool) -> Level | None:
     """The fit within the bounds asked for, or None where its error bars say that nothing determines it."""
     summed = ladder.summed(index)
-    fit = ladder.bounded(index, free) if nonnegative else maximise(summed, free.coefficients, nonnegative=False)
+    fit = ladder.bounded(index, free) if nonnegative else finished(summed, free)
     grid, groups = ladder.grids[index], ladder.groups(index)
     if len(groups) > 1:
         fit = groups.scaled(fit, grid, summed.exposure)
@@ -172,7 +174,7 @@ def _level(ladder: Ladder, index: int, free: Fit, nonnegative: bool) -> Level | 
     return level if math.isfinite(level.bound.source_error) else None
 
 
-def _first_worth_a_fit(ladder: Ladder) -> tuple[int, Array | None]:
+def _first_worth_a_fit(ladder: Ladder, nonnegative: bool) -> tuple[int, Array | None]:
     """Index of knots whose closed form misses the data's space by about what noise makes it miss, and is a start.
 
     Coarser ones are far from explaining the films, and a fit on them would only be a start for the next. Where finer ones
@@ -187,7 +189,7 @@ def _first_worth_a_fit(ladder: Ladder) -> tuple[int, Array | None]:
     if not math.isnan(excess):
         closed = ladder.closed(index + 1)
         if not closed.mismatch > _FAR_OFF * expected_mismatch(ladder.problem, ladder.space, closed) and _starts(closed):
-            if excess > _SURELY:
+            if excess > (_PERHAPS if nonnegative else _SURELY):
                 return index + 1, None
             return index, ladder.coarsened(index + 1, closed.coefficients)
     ladder.summed(index)  # which nearly every search asks for, and of which the closed form makes use

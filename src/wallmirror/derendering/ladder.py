@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wallmirror.derendering.finer import worth
 from wallmirror.derendering.groups import Groups, closed_form_in_groups, groups_of
-from wallmirror.derendering.likelihood import Fit, best_nonnegative, maximise
+from wallmirror.derendering.likelihood import ROUGH, Fit, best_nonnegative, maximise
 from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.nested import FINEST_QUADRATURE, Nested
 from wallmirror.derendering.problem import Problem
@@ -70,6 +70,14 @@ class Ladder:
     def holds(self, index: int) -> bool:
         """Whether `summed` takes no pass over the pixels any more."""
         return self.nested.holds(index)
+
+    def exposure(self, index: int) -> Array:
+        """How well each coefficient is seen, relative to the best-seen one, shape (K,)."""
+        if index in self._summed or not self.holds(index + 1):
+            return self.summed(index).exposure
+        halved = self.grids[index].in_halved()
+        seen = np.square(halved).T @ self.summed(index + 1).exposure
+        return np.asarray(seen / seen.max())
 
     def closed(self, index: int) -> ClosedForm:
         """The closed form."""
@@ -153,7 +161,9 @@ class Ladder:
             return self.closed(0).coefficients
         if index - 1 not in self._free:
             start = self.closed(index - 1).coefficients
-            self._free[index - 1] = maximise(self.summed(index - 1), start, nonnegative=False, rough=True)
+            self._free[index - 1] = maximise(
+                self.summed(index - 1), start, nonnegative=False, tolerance=ROUGH, held=True
+            )
         return self.refined(index - 1, self.bounded(index - 1, self._free[index - 1]).coefficients, index)
 
     def as_fine_as_the_bounds_want(self, index: int, free: Fit) -> tuple[int, Fit]:
@@ -170,7 +180,7 @@ class Ladder:
         ):
             try:
                 start = self.refined(index, free.coefficients, index + 1)
-                finer = maximise(self.summed(index + 1), start, nonnegative=False, rough=True)
+                finer = maximise(self.summed(index + 1), start, nonnegative=False, tolerance=ROUGH, held=True)
                 gain = self.bounded(index, free).objective - self.bounded(index + 1, finer).objective
             except UndeterminedError:
                 break

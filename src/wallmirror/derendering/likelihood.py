@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg as sl
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from wallmirror.derendering.convex import minimise_above, positive_factor
@@ -25,22 +26,28 @@ from wallmirror.derendering.information import Point, inverses, mixed, point_at,
 from wallmirror.derendering.moments import Moments, moments
 from wallmirror.errors import UndeterminedError
 
-__all__ = ["Fit", "Moments", "best_nonnegative", "maximise", "moments"]
+__all__ = ["ROUGH", "Fit", "Moments", "best_nonnegative", "finished", "maximise", "moments"]
 
 Array = NDArray[np.float64]
 
 # Cells seen less than this relative to the best-seen one are weak: noise rules them in a start.
 _WEAK = 1e-4
 _RIDGE = 1e-12
-# Share of the misfit by which a full step may still lower it, and by which one of a rough climb may.
-_TOLERANCE, _ROUGH = 1e-7, 1e-5
-# What holds the coefficients of a rough climb back, of the information that would leave one as uncertain as the largest one is
-# large: noise throws those that the captures hardly see about, and with them all others off the maximum.
+# Share of the misfit by which a full step may still lower it; and, of a datum's noise, what one may gain at the end of a climb
+# that is held back: a tenth turns the pattern by no more than a third of an error bar, if all of it lies in one direction.
+_TOLERANCE, _TENTH = 1e-7, 0.1
+#: The share between knots, where a fit need not be finer.
+ROUGH = 1e-5
+# What holds coefficients back, of the information that would leave one as uncertain as the largest one is large: noise throws
+# those that the captures hardly see about, and with them all others off the maximum.
 _DAMPING = 0.1
 # S is made anew where a step with that of the point before promises more than this share of what the last one did, or so
 # little, as a share of what ends the climb, that the climb seems to be over.
 _QUICK = 0.1
 _SURE = 0.01
+# How far a step within bounds may come from what it promised, as a share, for its S to say that the climb is over: without
+# bounds an S made anew may show what coefficients that the captures hardly see would gain.
+_KEPT = 0.05
 # Condition of H beyond which S, that C^T H^-1 C is taken from, keeps too few of its digits for a step without bounds.
 _LOST = 1e10
 
@@ -88,7 +95,7 @@ class _Curvature:
     pinned:
         S with the gauge; None where nothing depends on r.
     factor:
-        The Cholesky factor of that, as `positive_factor` makes it, where r has no bounds; of a rough climb with its damping.
+        The Cholesky factor of that, as `positive_factor` makes it, where r has no bounds; damped where coefficients are held.
     """
 
     free: NDArray[np.bool_]
@@ -103,7 +110,8 @@ def maximise(
     *starts: Array,
     nonnegative: bool = True,
     tolerance: float = _TOLERANCE,
-    rough: bool = False,
+    held: bool = False,
+    schur: Array | None = None,
     max_iterations: int = 60,
 ) -> Fit:
     """Climb to the maximum of the likelihood from the best of some starts (the closed form's r, a coarser fit).
@@ -116,9 +124,10 @@ def maximise(
         Keep r >= 0 and V >= 0.
     tolerance:
         Stop when a full step promises to change the objective by less than this share.
-    rough:
-        Stop earlier still, near the maximum without bounds: what is left to gain hangs on coefficients that the captures
-        hardly see.
+    held:
+        Hold coefficients that the captures hardly see near their start, without bounds: what they leave to gain is noise.
+    schur:
+        S at a single start, where it is known.
 
     Raises
     ------
@@ -131,16 +140,19 @@ def maximise(
     state = min(states, key=lambda candidate: candidate.objective)
     rounding = 1e-14 * float(np.sum(data.energy))
     curvature: _Curvature | None = None
-    slope = 0.0
+    slope, kept = 0.0, False
     for iteration in range(1, max_iterations + 1):
-        enough = (max(tolerance, _ROUGH) if rough else tolerance) * state.objective + rounding
+        enough = tolerance * state.objective + rounding
         pull = _pull(data, state, nonnegative=nonnegative)
         before, quick = slope, False
         if curvature is not None and np.array_equal(pull.free, curvature.free):
             dr, slope = _step(data, state, pull, curvature)
+            if kept and slope <= enough:
+                return _fit(state, iteration, converged=True)
             quick = _SURE * enough < slope <= _QUICK * before
         if not quick:
-            curvature = _curvature(data, state, pull.free, nonnegative=nonnegative, rough=rough)
+            known = schur if iteration == 1 else None
+            curvature = _curvature(data, state, pull.free, known, nonnegative=nonnegative, held=held)
             dr, slope = _step(data, state, pull, curvature)
             if slope <= enough:
                 return _fit(state, iteration, converged=True, curvature=curvature)
@@ -152,18 +164,32 @@ def maximise(
             length /= 2
             if length < 1e-10:
                 return _fit(state, iteration, converged=slope <= 1e-6 * state.objective + 1e3 * rounding)
+        gained = state.objective - trial.objective
+        kept = nonnegative and length == 1 and abs(gained - slope) <= _KEPT * slope
         state = trial
     return _fit(state, max_iterations, converged=False)
 
 
-def best_nonnegative(data: Moments, source: Array) -> Array:
-    """The r >= 0 of largest likelihood for a given pattern V >= 0 of shape (M, B): a convex problem, shape (K,)."""
+def finished(data: Moments, fit: Fit) -> Fit:
+    """The maximum without bounds as far as the captures see it, from a fit that came near it."""
+    tolerance = min(ROUGH, _TENTH / max(1, data.observations))
+    return maximise(data, fit.coefficients, nonnegative=False, tolerance=tolerance, held=True, schur=fit.schur)
+
+
+def best_nonnegative(data: Moments, source: Array, halved: sp.csr_array | None = None) -> Array:
+    """The r >= 0 of largest likelihood for a given pattern V >= 0 of shape (M, B): a convex problem, shape (K,).
+
+    On knots twice as far apart, if their `SplineGrid.in_halved` is given.
+    """
     v = np.maximum(source.T if source.sum() > 0 else -source.T, 0.0)
-    cells = np.flatnonzero(data.seen)
-    gram = data.gram_of_source(v)[cells][:, cells]
+    gram, pull, seen = data.gram_of_source(v), np.einsum("bi,bik->k", v, data.cross), data.seen
+    if halved is not None:
+        gram, pull, seen = halved.T @ gram @ halved, halved.T @ pull, halved.T @ seen > 0
+    cells = np.flatnonzero(seen)
+    gram = gram[cells][:, cells]
     gram[np.diag_indices_from(gram)] += _RIDGE * float(np.trace(gram)) / max(1, cells.size)
-    r = np.zeros(data.size)
-    r[cells] = minimise_above(np.zeros(cells.size), gram, np.einsum("bi,bik->k", v, data.cross)[cells])
+    r = np.zeros(seen.size)
+    r[cells] = minimise_above(np.zeros(cells.size), gram, pull[cells])
     return r
 
 
@@ -218,14 +244,16 @@ def _step(data: Moments, state: Point, pull: _Pull, curvature: _Curvature) -> tu
     return dr, float(pull.r @ dr)
 
 
-def _curvature(data: Moments, state: Point, free: NDArray[np.bool_], *, nonnegative: bool, rough: bool) -> _Curvature:
+def _curvature(
+    data: Moments, state: Point, free: NDArray[np.bool_], schur: Array | None, *, nonnegative: bool, held: bool
+) -> _Curvature:
     if not nonnegative and np.max(np.linalg.cond(state.normal)) > _LOST:
         raise UndeterminedError(
             "the captures do not tell the card's elements apart; capture more light, views or patterns"
         )
     cells = np.flatnonzero(data.seen)
     inverse = inverses(data, state, free)
-    schur = schur_complement(data, state, free, inverse, cells)
+    schur = schur_complement(data, state, free, inverse, cells) if schur is None else schur
     r = state.r[cells]
     level = np.trace(schur) / max(1, cells.size)
     if not level > 0:
@@ -238,7 +266,7 @@ def _curvature(data: Moments, state: Point, free: NDArray[np.bool_], *, nonnegat
     if nonnegative:
         return _Curvature(free, inverse, schur, pinned)
     largest = float(np.max(np.abs(state.r), where=data.exposure >= _WEAK, initial=0.0))
-    if rough and largest > 0:
+    if held and largest > 0:
         noise = max(0.0, state.objective) / max(1, data.observations)
         pinned[np.diag_indices_from(pinned)] += _DAMPING * noise / largest**2
     return _Curvature(free, inverse, schur, pinned, positive_factor(pinned))

@@ -45,15 +45,8 @@ class Pairs:
     @classmethod
     def of(cls, designs: list[sp.csr_array], windows: Windows | None, weight: Array) -> Pairs:
         """From T_1 .. T_M, cut into windows where that can be, and w of shape (P,)."""
-        elements, size = len(designs), designs[0].shape[1]
-        if windows is not None:
-            entries, columns, values = windows.grams(weight)
-        else:
-            entries, columns, values = _sparse_grams(designs, weight)
-        first = np.repeat(np.arange(0, entries.size, size), entries.reshape(-1, size).sum(axis=1))
-        pointers = np.concatenate([[0], np.cumsum(entries)])
-        above = sp.csr_array((values, columns + first, pointers), shape=(entries.size, entries.size))
-        return cls(above, elements)
+        above = _sparse_grams(designs, weight) if windows is None else windows.grams(weight)
+        return cls(above, len(designs))
 
     def coarser(self, halved: sp.csr_array) -> Pairs:
         """R^T N_ij R for R of shape (K, K')."""
@@ -111,6 +104,12 @@ class Pairs:
         width = int(np.max(row - column, initial=0)) + 1
         sums = np.bincount(place, weights=self.above.data[inside[below]], minlength=width * size)
         return np.asarray(sums.reshape(width, size), dtype=np.float64)
+
+    @cached_property
+    def exposures(self) -> Array:
+        """Diagonals of the N_ii, shape (M, K)."""
+        i, j = self._of
+        return np.asarray(self.above.diagonal().reshape(i.size, -1)[i == j])
 
     def times(self, r: Array) -> Array:
         """N_ij r, shape (M, M, K)."""
@@ -228,12 +227,10 @@ def _alike(inverse_variance: Array) -> tuple[Array, NDArray[np.intp]]:
     return weights, np.asarray(group).ravel().astype(np.intp)
 
 
-def _sparse_grams(designs: list[sp.csr_array], weight: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+def _sparse_grams(designs: list[sp.csr_array], weight: Array) -> sp.csr_array:
     """As `Windows.grams`, for matrices whose rows are no runs."""
     scaled = [
         sp.csr_array((t.data * np.repeat(weight, np.diff(t.indptr)), t.indices, t.indptr), t.shape) for t in designs
     ]
-    grams = [sp.csr_array(t.T @ right) for i, t in enumerate(designs) for right in scaled[i:]]
-    entries = np.concatenate([np.diff(gram.indptr) for gram in grams])
-    columns = np.concatenate([gram.indices for gram in grams])
-    return entries, columns.astype(np.intp), np.concatenate([gram.data for gram in grams])
+    grams = [t.T @ right for i, t in enumerate(designs) for right in scaled[i:]]
+    return sp.csr_array(sp.block_diag(grams, format="csr"))

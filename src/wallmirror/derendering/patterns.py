@@ -110,8 +110,9 @@ def standing_out(strength: Array, rows: int, realisations: int, free: int, units
 
 def free_coefficients(problem: Problem, level: Level, source: Array, sigma: float) -> int:
     """Most coefficients of rho that would be free, were one element dark: those that the others hardly show."""
-    weights = np.broadcast_to(np.square(problem.row_weights), (problem.data.shape[0], 1))[:, 0]
-    shown = exposures(level.designs, weights) * np.sum(source * source, axis=1)[:, None]
+    pairs = level.summed.pairs
+    alone = pairs[0].exposures if len(pairs) == 1 else exposures(level.designs, np.square(problem.row_weights[:, 0]))
+    shown = alone * np.sum(source * source, axis=1)[:, None]
     by_others = (np.sum(shown, axis=0) - shown)[:, level.summed.seen]
     largest = float(np.max(np.abs(level.free.coefficients)))
     return int(np.max(np.count_nonzero(by_others < (sigma / (_FREE * largest)) ** 2, axis=1)))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.facets import Factor, weighted
 from wallmirror.derendering.nested import FINEST_QUADRATURE, NOISY_STEPS, Nested
-from wallmirror.derendering.span import Span
+from wallmirror.derendering.span import Projected, Span
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, noise_edge, signal_space
 from wallmirror.errors import UndeterminedError
@@ -249,9 +249,10 @@ def _inverse_variance(
     """Weights of the pixels in units of the scale, which of them stated their noise, and whether that is but rounding."""
     with np.errstate(over="ignore"):
         variance = np.minimum(variance / scale / scale, _DROWNED)
-    # A pixel whose noise outshines the brightest sets no floor for the others, unless most are like it.
-    usual = max(1.0, float(np.median(variance[counts])))
-    largest = float(variance.max(initial=0.0, where=counts & (variance <= usual)))
+    largest = float(variance.max(initial=0.0, where=counts))
+    if largest > 1:  # a pixel whose noise outshines the brightest sets no floor for the others, unless most are like it
+        usual = max(1.0, float(np.median(variance[counts])))
+        largest = float(variance.max(initial=0.0, where=counts & (variance <= usual)))
     if largest <= _SILENT:
         return counts.astype(np.float64), counts, True
     floor = _VARIANCE_FLOOR * largest
@@ -289,22 +290,36 @@ def _signal_space(problem: Problem, *, weak_patterns: bool) -> SignalSpace:
         return space
     certain = floor < _ROUNDING * space.singular_values[0]
     if not certain:
-        # Where patterns drown in the films, the finest BRDF grid in whose span they stand out is taken.
-        nested, best = _nested_for_spans(problem), None
-        for index in range(_FINEST_SPAN, -1, -1):
-            span = Span.of(nested.moments(index), problem.data.shape[0])
-            within = span.projected(elements, noise=1.0 if problem.noise_is_stated else None)
-            if within.rank > (space if best is None else best[1]).rank:
-                best = index, within
-            if within.rank == elements:
-                break
-        if best is not None:
-            space = best[1].space(nested.designs(best[0]), problem.row_weights)
+        nested = _nested_for_spans(problem)
+        index, within = _within_a_span(problem, nested)
+        if within.rank > space.rank:
+            space = within.space(nested.designs(index), problem.row_weights)
         if space.rank == elements:
             return space
     if certain or not weak_patterns:
         raise too_few_patterns(space.rank, elements)
     return space
+
+
+def _within_a_span(problem: Problem, nested: Nested) -> tuple[int, Projected]:
+    """The films' projection onto the span of the finest knots on which no pattern drowns, or on which fewest do; their index.
+
+    The coarser the knots, the less noise is left: where patterns drown on the coarsest as well, those between are not tried.
+    """
+    elements, noise = problem.card.elements, 1.0 if problem.noise_is_stated else None
+
+    def on(index: int) -> tuple[int, Projected]:
+        span = Span.of(nested.moments(index), problem.data.shape[0])
+        return index, span.projected(elements, noise=noise)
+
+    finest = on(_FINEST_SPAN)
+    if finest[1].rank == elements:
+        return finest
+    coarsest = on(0)
+    if coarsest[1].rank < elements:
+        return max(finest, coarsest, key=lambda found: found[1].rank)
+    between = (on(index) for index in range(_FINEST_SPAN - 1, 0, -1))
+    return next((found for found in between if found[1].rank == elements), coarsest)
 
 
 def _nested_for_spans(problem: Problem) -> Nested:

@@ -12,8 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import cast
 
-from threadpoolctl import threadpool_limits
-
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.angle_sum_check import with_doubt
 from wallmirror.derendering.calibration import Calibration
@@ -26,6 +24,7 @@ from wallmirror.derendering.placed import widened
 from wallmirror.derendering.solution import Solution
 from wallmirror.derendering.stages import Answer, Asked
 from wallmirror.geometry import Card
+from wallmirror.threads import one_blas_thread
 
 
 def solve(
@@ -133,8 +132,7 @@ def solve(
     )
     if calibration is not None:
         captures = replace(captures, card=calibration.card)
-    # The matrices are small: two BLAS threads that wait for each other are up to a hundred times slower than one.
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_blas_thread():
         problem, space = asked.prepared(captures)
         answer = asked.answered(problem, space)
         problem, estimate, angle_sum = answer.problem, answer.estimate, answer.angle_sum

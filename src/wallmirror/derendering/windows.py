@@ -102,13 +102,10 @@ class Windows:
         high = maximum_filter1d(high, width, axis=0, origin=(width - 1) // 2, mode="constant", cval=0)
         return low, high
 
-    def grams(self, weight: Array) -> tuple[NDArray[np.intp], Indices, Array]:
-        """N_ij = T_i^T W T_j for i <= j, in the order (0, 0), (0, 1), ..., (0, M - 1), (1, 1), ...
+    def grams(self, weight: Array) -> sp.csr_array:
+        """N_ij = T_i^T W T_j for i <= j, along the diagonal in the order (0, 0), (0, 1), ..., (0, M - 1), (1, 1), ...
 
-        Returns
-        -------
-        Of the stack of all these (K, K) matrices: the entries of each row, shape (M (M + 1) / 2 K,), and column and value of
-        the entries that are not 0, row by row.
+        The entries that are not 0 of all these (K, K) matrices, for w of shape (P,).
         """
         count, height, elements, width = self.blocks.shape
         weights = self.cut(weight[:, None])
@@ -117,7 +114,10 @@ class Windows:
         left = np.empty((count, height, width))
         products = np.empty(count * width * elements * width)
         places = np.empty(products.size, dtype=np.intp)
-        found = []
+        order, most = elements * (elements + 1) // 2 * self.size, self.most_entries()
+        narrow = np.int32 if max(order, most) < np.iinfo(np.int32).max else np.int64
+        columns, values, pointers = np.empty(most, narrow), np.empty(most), np.zeros(order + 1, narrow)
+        rows = known = 0
         for i in range(elements):
             np.multiply(weights, self.blocks[:, :, i], out=left)
             right = self.blocks[:, :, i:].reshape(count, height, -1)
@@ -133,10 +133,15 @@ class Windows:
             np.add((shift[row] + self.begin[:, None, i:])[..., None], ahead, out=place.reshape(*row.shape, width))
             table = np.bincount(place, weights=product, minlength=int(end[-1]))
             filled = np.flatnonzero(table)
-            of_row = np.diff(np.searchsorted(filled, end), prepend=0)
-            found.append((of_row, filled - np.repeat(shift, of_row), table[filled]))
-        of_rows, columns, values = (np.concatenate(part) for part in zip(*found, strict=True))
-        return of_rows, columns, values
+            until = np.searchsorted(filled, end)
+            # Each matrix begins on the diagonal where its rows do.
+            aside = shift - np.repeat(np.arange(rows, rows + end.size, self.size), self.size)
+            found = slice(known, known + filled.size)
+            np.subtract(filled, np.repeat(aside, np.diff(until, prepend=0)), out=columns[found], casting="same_kind")
+            np.take(table, filled, out=values[found])
+            pointers[rows + 1 : rows + 1 + end.size] = known + until
+            rows, known = rows + end.size, known + filled.size
+        return sp.csr_array((values[:known], columns[:known], pointers), shape=(order, order))
 
 
 def _cuts(runs: Indices) -> Indices:
