@@ -101,4 +101,4 @@ def far_apart() -> tuple[Observer, Card]:
 def space_within(data: Array, designs: list[sp.csr_array], elements: int, *, noise: float | None) -> SignalSpace:
     """U from the films' projection onto the span of their designs, see `Span`."""
     projected = Span.of(moments(data, designs), data.shape[0]).projected(elements, noise=noise)
-    return projected.space(designs, np.ones((data.shape[0], 1)))
+    return projected.space(designs, np.ones((data.shape[0], 1)), sp.eye_array(designs[0].shape[1], format="csr"))

@@ -160,7 +160,7 @@ def test_coarser_knots_follow_from_finer_ones() -> None:
         return Span.of(summed, data.shape[0]).projected(ELEMENTS, noise=0.2)
 
     every = np.ones((data.shape[0], 1))
-    inherited = projected(fine.coarser(halved)).space(design_matrices(kernel, coarse), every)
+    inherited = projected(fine.coarser(halved)).space(design_matrices(kernel, coarse.halved()), every, halved)
     assert (inherited.rank, inherited.dimensions) == (direct.rank, direct.dimensions)
     # Both know the span's weakest directions to 2e-16 / 1e-10.
     np.testing.assert_allclose(inherited.singular_values, direct.singular_values, rtol=1e-5)

@@ -87,12 +87,14 @@ class Ladder:
                 weighted = problem.weighted(self.designs(index))
                 made = closed_form_in_groups(problem.weighted_data, weighted, self.space, groups)
             else:
+                at_hand = self.nested.designed(index) if self.holds(index) else index
                 made = closed_form(
                     problem.weighted_data,
-                    self.designs(index),
+                    self.designs(at_hand),
                     self.space,
                     row_weights=problem.row_weights,
                     band=self.band(index),
+                    prolongation=self.nested.prolongation(index, at_hand) if at_hand > index else None,
                 )
             self._closed[index] = made
         return self._closed[index]
@@ -226,9 +228,7 @@ class Ladder:
 
     def refined(self, index: int, r: Array, to: int) -> Array:
         """Coefficients of one grid on a finer one."""
-        for grid in self.grids[index:to]:
-            r = grid.in_halved() @ r
-        return r
+        return np.asarray(self.nested.prolongation(index, to) @ r, dtype=np.float64)
 
     def coarsened(self, index: int, r: Array) -> Array:
         """Coefficients on the next coarser grid that come nearest where the captures look."""

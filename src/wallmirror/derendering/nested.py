@@ -81,6 +81,17 @@ class Nested:
             self._designs[index] = design_matrices(self.kernel(step, self.quadrature), self.grids[index])
         return self._designs[index]
 
+    def designed(self, index: int) -> int:
+        """The coarsest knots, from these on, whose designs are made; these if none are."""
+        return min((finer for finer in self._designs if finer >= index), default=index)
+
+    def prolongation(self, index: int, finer: int) -> sp.csr_array:
+        """R of shape (K, K'): coefficients r' of one grid are R r' on a finer one."""
+        product = sp.eye_array(self.grids[index].size, format="csr")
+        for grid in self.grids[index:finer]:
+            product = sp.csr_array(grid.in_halved() @ product)
+        return product
+
     def moments(self, index: int) -> Moments:
         """What the likelihood needs of the data."""
         if index not in self._moments:

@@ -293,7 +293,8 @@ def _signal_space(problem: Problem, *, weak_patterns: bool) -> SignalSpace:
         nested = _nested_for_spans(problem)
         index, within = _within_a_span(problem, nested)
         if within.rank > space.rank:
-            space = within.space(nested.designs(index), problem.row_weights)
+            prolongation = nested.prolongation(index, _FINEST_SPAN)
+            space = within.space(nested.designs(_FINEST_SPAN), problem.row_weights, prolongation)
         if space.rank == elements:
             return space
     if certain or not weak_patterns:

@@ -104,10 +104,18 @@ class Projected:
     rank: int
     dimensions: int
 
-    def space(self, designs: list[sp.csr_array], row_weights: Array) -> SignalSpace:
-        """U itself, by a pass over the pixels: from T_1 .. T_M (P, K) and what their rows are weighted with, (P, 1)."""
+    def space(self, designs: list[sp.csr_array], row_weights: Array, prolongation: sp.csr_array) -> SignalSpace:
+        """U itself, by a pass over the pixels.
+
+        Parameters
+        ----------
+        designs, row_weights:
+            T_1 .. T_M (P, K), and what their rows are weighted with, (P, 1).
+        prolongation:
+            R of shape (K, K') from the knots of the span to those of the designs.
+        """
         parts = np.split(self.basis.combined(self.left), len(designs))
-        films = sum(t @ part for t, part in zip(designs, parts, strict=True))
+        films = sum(t @ (prolongation @ part) for t, part in zip(designs, parts, strict=True))
         return SignalSpace(row_weights * films, self.singular_values, self.rank, self.dimensions)
 
 

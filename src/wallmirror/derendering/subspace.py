@@ -136,6 +136,7 @@ def closed_form(
     *,
     row_weights: Array | None = None,
     band: Array | None = None,
+    prolongation: sp.csr_array | None = None,
 ) -> ClosedForm:
     """Recover r, F and V from data whose rank is M: minimise sum_i |(I - U U^T) T_i r|^2.
 
@@ -150,7 +151,9 @@ def closed_form(
     row_weights:
         Of shape (P, 1), where the data's rows are weighted and the designs' are not yet.
     band:
-        `banded_gram(designs, row_weights)` where it is known already.
+        `banded_gram(designs, row_weights)` where it is known already; that of the coarser knots with a prolongation.
+    prolongation:
+        R of shape (K, K'), where r' on coarser knots is sought, R r' being r; K' takes the place of K in the result.
 
     Notes
     -----
@@ -158,18 +161,20 @@ def closed_form(
     q is the leading eigenvector of H A^-1 H^T, whose eigenvalues lie in [0, 1].
     """
     u = space.basis
-    size = designs[0].shape[1]
     weights = np.ones((u.shape[0], 1)) if row_weights is None else row_weights
     weighted = weights * u
     stacked = np.concatenate([(t.T @ weighted).T for t in designs])  # H, (M^2, K); rows i*M..i*M+M-1 belong to T_i
+    stacked = stacked if prolongation is None else stacked @ prolongation
+    size = stacked.shape[1]
     band = banded_gram(designs, row_weights) if band is None else band
     factor = _banded_cholesky(band)
     values, vectors = _leading_pairs(stacked, factor, len(designs))
     r = sl.cho_solve_banded((factor, True), stacked.T @ vectors[:, 0])
     projected = (stacked @ r).reshape(len(designs), -1).T  # W, (M, M): column i is U^T T_i r
     norm, missed = 0.0, 0.0
+    whole = r if prolongation is None else prolongation @ r
     for i, t in enumerate(designs):
-        column = weights[:, 0] * (t @ r)
+        column = weights[:, 0] * (t @ whole)
         # The residual itself: 1 - lambda_1 from the eigenvalue would end at 1e-16, this goes on to its square.
         missed += float(np.sum((column - u @ projected[:, i]) ** 2))
         norm += float(column @ column)
