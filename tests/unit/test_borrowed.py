@@ -61,7 +61,8 @@ UNREACHED = (
     Card(elements_x=(-1.8, 0.2, 1.94), y=-3.45),
     Sum(parts=(GaussianTrain(centres=(0.487,), sigma=math.radians(1.1)), Diffuse(albedo=0.18))),
 )
-SEEDS = 4
+#: Where noise makes a pattern that is refused for what it is at once, there is nothing to believe: not of these.
+SEEDS = (2, 3, 4, 5)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +79,7 @@ def test_what_the_noise_in_the_wall_alone_tells_is_not_called_good(
 ) -> None:
     observer, card, brdf = scene
     z = []
-    for seed in range(SEEDS):
+    for seed in SEEDS:
         captures, source = filmed(observer, card, brdf, patterns, decibels, seed=seed)
         try:
             assert "noise in the BRDF" in " ".join(solve(captures, step_deg=step_deg).warnings)
