@@ -17,12 +17,14 @@ from scipy.interpolate import BSpline
 
 from wallmirror.brdf import GaussianTrain
 from wallmirror.captures import CaptureSet
+from wallmirror.derendering.bounds import cramer_rao
 from wallmirror.derendering.climbing import climb
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.finer import Films, Finer, loss, score, worth
 from wallmirror.derendering.information import information, point_at
 from wallmirror.derendering.ladder import Ladder
-from wallmirror.derendering.likelihood import Fit, maximise, moments
+from wallmirror.derendering.light import Lit, Missed, missed_in_the_light
+from wallmirror.derendering.likelihood import ROUGH, Fit, finished, maximise, moments
 from wallmirror.derendering.nested import NOISY_STEPS
 from wallmirror.derendering.problem import prepare
 from wallmirror.derendering.solve import solve
@@ -218,13 +220,13 @@ def test_what_coarser_knots_lose_is_foretold(columns: int) -> None:
     assert loss(schur, best.coefficients, 1e-9 * pull, halved)[0] < 1e-3 * lost
 
 
-def ladder_at(decibels: float) -> Ladder:
+def ladder_at(decibels: float, *, sigma_deg: float = 1.0, pixels: int = 500, seed: int = 1) -> Ladder:
     """Thesis-like captures of narrow lobes, in noise that is stated."""
-    observer, card = thesis_observer(500, 8), thesis_card(4)
+    observer, card = thesis_observer(pixels, 8), thesis_card(4)
     source = np.random.default_rng(5).random((4, 9))
-    films = radiance(transport_matrix(observer, card, lobes(sigma_deg=1), weights="cosine"), source)
+    films = radiance(transport_matrix(observer, card, lobes(sigma_deg=sigma_deg), weights="cosine"), source)
     noise = float(np.sqrt(np.mean(films**2))) * 10 ** (-decibels / 20)
-    films = films + noise * np.random.default_rng(1).standard_normal(films.shape)
+    films = films + noise * np.random.default_rng(seed).standard_normal(films.shape)
     variance = np.full(films.shape, noise**2)
     captures = CaptureSet(observer=observer, card=card, transport="cosine", radiance=films, variance=variance)
     problem, space = prepare(captures)
@@ -271,6 +273,77 @@ def test_a_fit_on_coarser_knots_that_comes_to_another_maximum_is_tried_again(see
     weak = int(np.count_nonzero((ladder.summed(coarse).exposure < 1e-4) & ladder.summed(coarse).seen))
     assert 0 < weak < 10
     assert fits[coarse].objective == pytest.approx(sound.objective, abs=weak + 4 * math.sqrt(2 * weak))
+
+
+# -- free fits that are held, and the light -------------------------------------------------------------------------
+
+
+def test_a_climb_that_is_held_ends_beside_the_maximum_in_fewer_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    ladder, fine = ladder_at(20), NOISY_STEPS.index(0.5)
+    summed, start, grid = ladder.summed(fine), ladder.closed(fine).coefficients, ladder.grids[fine]
+    free = maximise(summed, start, nonnegative=False)
+    held = maximise(summed, start, nonnegative=False, tolerance=ROUGH, held=True)
+    assert held.converged
+    assert held.iterations < free.iterations
+    gauge = grid.row(grid.peak(free.coefficients, summed.exposure))
+    bound = cramer_rao(summed, free.coefficients, free.source, gauge=gauge)
+    for fit in (held, finished(summed, held)):
+        # What coefficients leave to gain that the captures hardly see turns the pattern by no more than this.
+        assert scale_free_error(fit.source, free.source) < 0.1 * bound.source_error
+        assert fit.objective - free.objective < 1
+    # The planted fault: all coefficients are held, so that the climb creeps.
+    monkeypatch.setattr("wallmirror.derendering.likelihood._DAMPING", 1e8)
+    crept = maximise(summed, start, nonnegative=False, tolerance=ROUGH, held=True)
+    assert not crept.converged
+    assert crept.objective - free.objective > 100
+
+
+def held_at(ladder: Ladder, index: int) -> Fit:
+    start = ladder.closed(index).coefficients
+    return maximise(ladder.summed(index), start, nonnegative=False, tolerance=ROUGH, held=True)
+
+
+def test_what_coarser_knots_miss_in_the_light_is_what_finer_ones_would_gain() -> None:
+    """From the finer fit and its moments, as from the coarser fit and the pixels (Wald, Rao)."""
+    ladder, fine = ladder_at(20), NOISY_STEPS.index(0.5)
+    finer, coarser = held_at(ladder, fine), held_at(ladder, fine - 1)
+    missed = missed_in_the_light(ladder, fine, finer)
+    assert missed is not None
+    within = ladder.bounded(fine - 1, coarser)
+    lit = Lit.of(ladder, fine - 1, within.coefficients, fine)
+    assert lit is not None
+    assert missed.added == np.count_nonzero(lit.fine & ladder.summed(fine).seen) - lit.used
+    transport = np.stack([t @ within.coefficients for t in ladder.designs(fine - 1)], axis=1)
+    films = Films(ladder.problem.data, ladder.problem.fit_weights, transport, within.source)
+    found = score(films, ladder.designs(fine), ladder.band(fine), lit.fine, enough=math.inf)
+    # Both are quadratic, about two points that are some error bars apart.
+    assert missed.loss == pytest.approx(found.gain, rel=0.15)
+    # The twin: where the ground glows as well, no angle is dark.
+    assert Lit.of(ladder, fine - 1, within.coefficients + 0.1 * within.coefficients.max(), fine) is None
+
+
+def test_noise_is_not_missed_in_the_light_and_narrow_lobes_are() -> None:
+    fine = NOISY_STEPS.index(0.5)
+    losses = {2.0: [], 0.7: []}  # type: dict[float, list[float]]
+    for sigma_deg, ratios in losses.items():
+        for seed in range(4):
+            ladder = ladder_at(20, sigma_deg=sigma_deg, pixels=250, seed=seed)
+            missed = missed_in_the_light(ladder, fine, held_at(ladder, fine))
+            assert missed is not None
+            ratios.append(missed.loss / missed.price)
+    # Noise passes the price in less than 1 % of cases, as dark coefficients have no part in it.
+    assert max(losses[2.0]) < 1
+    assert min(losses[0.7]) > 3
+
+
+def test_a_rho_without_jumps_has_little_left_for_knots_twice_as_fine_again() -> None:
+    added, freedom = 40, 10**6
+    price = worth(added, freedom)
+    # At the price exactly, all but the noise's mean may be the splines' own, and as much as noise hides of it.
+    assert Missed(price, added, freedom).foretells_nothing(2 * added)
+    # The twin: so much is missed that an eighth of it would still be worth the knots.
+    needed = worth(2 * added, freedom) - 2 * added
+    assert not Missed(added + 8 * needed, added, freedom).foretells_nothing(2 * added)
 
 
 def test_what_stands_for_a_band_leads_the_search_as_well() -> None:

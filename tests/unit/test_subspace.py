@@ -255,6 +255,25 @@ def test_rows_weighted_on_the_way_are_rows_weighted_before() -> None:
     assert up_to_scale(closed_form(weights * data, designs, space).source, before.source) > 1e-3
 
 
+def test_coarser_knots_through_the_designs_of_finer_ones_are_those_through_their_own() -> None:
+    observer, card = thesis_observer(), thesis_card()
+    kernel = build_kernel(observer, card, weights="cosine", resolution=0.1, tolerance=1e-9)
+    rows = radiance(kernel.apply(lobes(sigma_deg=6)), patterns()).reshape(-1, 20)
+    space, coarse = signal_space(rows, 4), grid_for(kernel, step=math.radians(6), degree=5)
+    own, finer = design_matrices(kernel, coarse), design_matrices(kernel, coarse.halved())
+    band, weights = banded_gram(own), np.ones((rows.shape[0], 1))
+    expected = closed_form(rows, own, space, row_weights=weights, band=band)
+    halved = coarse.in_halved()
+    through = closed_form(rows, finer, space, row_weights=weights, band=band, prolongation=halved)
+    assert through.mismatch == pytest.approx(expected.mismatch, rel=1e-6)
+    np.testing.assert_allclose(through.source, expected.source, rtol=1e-9)
+    assert through.coefficients.shape == (coarse.size,)
+    # The planted fault: coefficients of coarser knots that are put one knot aside.
+    aside = sp.csr_array(np.roll(halved.toarray(), 1, axis=0))
+    wrong = closed_form(rows, finer, space, row_weights=weights, band=band, prolongation=aside)
+    assert wrong.mismatch > 2 * expected.mismatch
+
+
 @pytest.mark.parametrize("factor", [1.01, 0.99])
 def test_a_wrong_distance_of_the_card_shows_in_the_mismatch(factor: float) -> None:
     observer, card, source = thesis_observer(), thesis_card(), patterns()

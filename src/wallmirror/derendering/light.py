@@ -92,13 +92,17 @@ def missed_in_the_light(ladder: Ladder, finer: int, fit: Fit) -> Missed | None:
     None where most of the angles are lit.
     """
     summed, halved = ladder.summed(finer), ladder.grids[finer - 1].in_halved()
-    lit = Lit.of(ladder, finer - 1, best_nonnegative(summed, fit.source, halved), finer)
+    coarse = best_nonnegative(summed, fit.source, halved)
+    lit = Lit.of(ladder, finer - 1, coarse, finer)
     if lit is None:
         return None
     within = ladder.bounded(finer, fit)
     cells = np.flatnonzero(lit.fine & summed.seen)
     schur = schur_on(summed, within.coefficients, within.source, cells)
     pull = np.einsum("ib,bik->k", within.source, summed.cross)[cells]
-    lost, _ = loss(schur, within.coefficients[cells], pull, sp.csr_array(halved[cells][:, lit.coarse]))
+    # What dark coefficients have a part in beside the lit ones is not for these to make up for.
+    whole = halved @ coarse
+    dark = halved @ np.where(lit.coarse, 0.0, coarse) * (within.coefficients @ whole / (whole @ whole))
+    lost, _ = loss(schur, (within.coefficients - dark)[cells], pull, sp.csr_array(halved[cells][:, lit.coarse]))
     freedom = ladder.freedom(finer)
     return Missed(lost / ladder.variance(fit.objective, freedom), max(1, cells.size - lit.used), freedom)

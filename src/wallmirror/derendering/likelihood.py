@@ -45,8 +45,8 @@ _DAMPING = 0.1
 # little, as a share of what ends the climb, that the climb seems to be over.
 _QUICK = 0.1
 _SURE = 0.01
-# How far a step within bounds may come from what it promised, as a share, for its S to say that the climb is over: without
-# bounds an S made anew may show what coefficients that the captures hardly see would gain.
+# How far a step within bounds may come from what it promised, as a share, for its S to say that the climb is over if it seems
+# to be: without bounds an S made anew may show what coefficients that the captures hardly see would gain.
 _KEPT = 0.05
 # Condition of H beyond which S, that C^T H^-1 C is taken from, keeps too few of its digits for a step without bounds.
 _LOST = 1e10
@@ -147,7 +147,7 @@ def maximise(
         before, quick = slope, False
         if curvature is not None and np.array_equal(pull.free, curvature.free):
             dr, slope = _step(data, state, pull, curvature)
-            if kept and slope <= enough:
+            if kept and slope <= _SURE * enough:
                 return _fit(state, iteration, converged=True)
             quick = _SURE * enough < slope <= _QUICK * before
         if not quick:
