@@ -18,7 +18,7 @@ from scipy.interpolate import BSpline
 from wallmirror.brdf import GaussianTrain
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.bounds import cramer_rao
-from wallmirror.derendering.climbing import climb
+from wallmirror.derendering.climbing import Start, climb
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.finer import Films, Finer, loss, score, worth
 from wallmirror.derendering.information import information, point_at
@@ -266,7 +266,7 @@ def test_a_fit_on_coarser_knots_that_comes_to_another_maximum_is_tried_again(see
     astray = maximise(ladder.summed(coarse), ladder.coarsened(fine, best.coefficients), nonnegative=False)
     sound = maximise(ladder.summed(coarse), ladder.closed(coarse).coefficients, nonnegative=False)
     assert astray.objective > 100 * sound.objective  # or there is nothing to try again
-    fits, _ = climb(ladder, fine, None, False, None, lambda _: None)
+    fits, _ = climb(ladder, Start(fine), False, None, lambda _: None)
     # The knots that noise alone calls for, with the fit on them as good as a climb ends between knots: but for what those
     # coefficients gain that the captures hardly see, each a unit of noise.
     assert list(fits) == [coarse]

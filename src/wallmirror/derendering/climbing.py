@@ -41,19 +41,28 @@ class Other:
     objective: float
 
 
-def climb(
-    ladder: Ladder, begin: int, start: Array | None, nonnegative: bool, tolerance: float | None, tell: Tell
-) -> tuple[dict[int, Fit], Other | None]:
-    """The free fits on the knots taken, by index, and what finer ones that were not would make of the last.
+@dataclass(frozen=True)
+class Start:
+    """Where a climb begins: index of the knots, and r (K,) on them with its V (M, B); the closed form's if left out."""
 
-    Parameters
-    ----------
-    begin, start:
-        Index of the first knots to be fitted, and the r to start from, shape (K,), if not the closed form's.
-    """
-    climber = _Climber(ladder, nonnegative, tell)
+    index: int
+    coefficients: Array | None = None
+    source: Array | None = None
+
+
+def climb(
+    ladder: Ladder, start: Start, nonnegative: bool, tolerance: float | None, tell: Tell
+) -> tuple[dict[int, Fit], Other | None]:
+    """The free fits on the knots taken, by index, and what finer ones that were not would make of the last."""
+    climber, begin = _Climber(ladder, nonnegative, tell), start.index
     ladder.summed(begin)  # of which the closed form makes use
-    first = climber.fit(begin, ladder.closed(begin).coefficients if start is None else start)
+    r, source = start.coefficients, start.source
+    if r is None or source is None:
+        r, source = ladder.closed(begin).coefficients, ladder.closed(begin).source
+    starts = [r]
+    if nonnegative and ladder.space.rank == ladder.problem.card.elements:
+        starts.append(ladder.begun(begin, source).coefficients)
+    first = climber.fit(begin, *starts)
     index, best, rival = climber.down(begin, first)
     if rival is not None:
         return {index: best}, rival

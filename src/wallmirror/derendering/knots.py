@@ -15,7 +15,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from wallmirror.derendering.bounds import Bound, bound_of
-from wallmirror.derendering.climbing import Other, Tell, climb
+from wallmirror.derendering.climbing import Other, Start, Tell, climb
 from wallmirror.derendering.finer import worth
 from wallmirror.derendering.groups import Groups
 from wallmirror.derendering.information import Information, information
@@ -131,10 +131,11 @@ def refine(
         If fewer patterns than elements stand out of the noise, or no knots are coarse enough to be determined.
     """
     ladder = Ladder.of(problem, space, steps, tolerance)
-    begin, start = _first_worth_a_fit(ladder, nonnegative)
+    start = _first_worth_a_fit(ladder, nonnegative)
     while True:
+        begin = start.index
         try:
-            fits, rival = climb(ladder, begin, start, nonnegative, tolerance, tell)
+            fits, rival = climb(ladder, start, nonnegative, tolerance, tell)
         except UndeterminedError:
             if begin == 0 and space.rank < problem.card.elements:
                 raise too_few_patterns(space.rank, problem.card.elements) from None
@@ -154,7 +155,7 @@ def refine(
             rival = None
         if begin == 0:
             break
-        begin, start = begin - 1, None
+        start = Start(begin - 1)
     if space.rank < problem.card.elements:
         raise too_few_patterns(space.rank, problem.card.elements)
     raise UndeterminedError(
@@ -174,40 +175,39 @@ def _level(ladder: Ladder, index: int, free: Fit, nonnegative: bool) -> Level | 
     return level if math.isfinite(level.bound.source_error) else None
 
 
-def _first_worth_a_fit(ladder: Ladder, nonnegative: bool) -> tuple[int, Array | None]:
-    """Index of knots whose closed form misses the data's space by about what noise makes it miss, and is a start.
+def _first_worth_a_fit(ladder: Ladder, nonnegative: bool) -> Start:
+    """The knots whose closed form misses the data's space by about what noise makes it miss, and is a start.
 
     Coarser ones are far from explaining the films, and a fit on them would only be a start for the next. Where finer ones
     miss as much, it is not for the knots; where none comes near, or the noise is not known, the search begins with the
     coarsest. Mismatches as a whole do not show a spline's error that a fit would: that is foretold from the detail of rho.
-    With the index comes a start r, shape (K,), if it is not the closed form on these knots.
     """
     if ladder.space.rank < ladder.problem.card.elements:
-        return 0, None
+        return Start(0)
     index = max(0, ladder.last - 2)
     excess = _excess_of_detail(ladder, index + 1)
     if not math.isnan(excess):
         closed = ladder.closed(index + 1)
         if not closed.mismatch > _FAR_OFF * expected_mismatch(ladder.problem, ladder.space, closed) and _starts(closed):
             if excess > (_PERHAPS if nonnegative else _SURELY):
-                return index + 1, None
-            return index, ladder.coarsened(index + 1, closed.coefficients)
+                return Start(index + 1)
+            return Start(index, ladder.coarsened(index + 1, closed.coefficients), closed.source)
     ladder.summed(index)  # which nearly every search asks for, and of which the closed form makes use
     closed = ladder.closed(index)
     expected = expected_mismatch(ladder.problem, ladder.space, closed)
     if math.isnan(expected):
-        return 0, None
+        return Start(0)
     if not closed.mismatch > _FAR_OFF * expected:
-        return (index if _starts(closed) else 0), None
+        return Start(index if _starts(closed) else 0)
     for finer in range(index + 1, ladder.last + 1):
         if closed.gap < _GAP * closed.mismatch:
             break
         coarser, closed = closed, ladder.closed(finer)
         if not closed.mismatch > _FAR_OFF * expected_mismatch(ladder.problem, ladder.space, closed):
-            return finer, None
+            return Start(finer)
         if closed.mismatch > _ALIKE * coarser.mismatch:
-            return (finer - 1 if coarser.error < _START else 0), None
-    return 0, None
+            return Start(finer - 1 if coarser.error < _START else 0)
+    return Start(0)
 
 
 def _starts(closed: ClosedForm) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -39,6 +40,7 @@ class Ladder:
     _groups: dict[int, Groups] = field(default_factory=dict)
     _closed: dict[int, ClosedForm] = field(default_factory=dict)
     _free: dict[int, Fit] = field(default_factory=dict)
+    _begun: dict[int, Fit] = field(default_factory=dict)
     _bounded: dict[int, Fit] = field(default_factory=dict)
 
     @classmethod
@@ -132,18 +134,34 @@ class Ladder:
             self._smooth_bands[index] = band
         return self._smooth_bands[index]
 
+    def begun(self, index: int, source: Array) -> Fit:
+        """The maximum within the bounds, from the best rho >= 0 for a pattern (M, B) that a start has.
+
+        The bounds hold the coefficients that noise would throw about without them, so that it takes few steps.
+        """
+        if index not in self._begun:
+            summed = self.summed(index)
+            self._begun[index] = maximise(summed, best_nonnegative(summed, source))
+        return self._begun[index]
+
     def bounded(self, index: int, free: Fit) -> Fit:
         """The maximum within the bounds, from the free one, or from coarser knots where that leads nowhere near it."""
         if index not in self._bounded:
             summed = self.summed(index)
             # Clipping a start can throw it into the valley of another maximum, so the first start is the best rho >= 0 for
             # the free maximum's pattern.
-            best = maximise(summed, best_nonnegative(summed, free.source))
-            for start in ("free", "coarser"):
-                if self.agrees(index, free, best):
+            starts: tuple[Callable[[], Array], ...] = (
+                lambda: best_nonnegative(summed, free.source),
+                lambda: free.coefficients,
+                lambda: self._from_coarser(index),
+            )
+            best = self._begun.get(index)
+            for start in starts:
+                if best is not None and self.agrees(index, free, best):
                     break
-                r = free.coefficients if start == "free" else self._from_coarser(index)
-                best = min(best, maximise(summed, r), key=lambda fit: fit.objective)
+                found = maximise(summed, start())
+                best = found if best is None else min(best, found, key=lambda fit: fit.objective)
+            assert best is not None
             self._bounded[index] = best
         return self._bounded[index]
 
