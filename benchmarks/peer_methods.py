@@ -27,7 +27,7 @@ from scipy.optimize import linear_sum_assignment, minimize
 from wallmirror import CaptureSet, scale_free_error
 from wallmirror.derendering.box_qp import solve_box_qps
 from wallmirror.derendering.likelihood import Moments, best_nonnegative, moments
-from wallmirror.derendering.problem import prepare
+from wallmirror.derendering.preparing import prepare
 from wallmirror.derendering.unstructured import de_render_unstructured
 
 Array = NDArray[np.float64]

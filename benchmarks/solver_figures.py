@@ -46,7 +46,7 @@ from wallmirror.derendering.general import SplineTable, solve_general
 from wallmirror.derendering.general_stack import Stack
 from wallmirror.derendering.moments import moments
 from wallmirror.derendering.poisson import poisson_bound
-from wallmirror.derendering.problem import prepare
+from wallmirror.derendering.preparing import prepare
 from wallmirror.files import write_atomically
 
 LOBES = GaussianTrain.of_the_code()

@@ -83,7 +83,7 @@ def algorithm_1() -> Work:
 
 
 def spline_designs() -> Work:
-    from wallmirror.derendering.problem import prepare
+    from wallmirror.derendering.preparing import prepare
 
     problem, _ = prepare(_captures())
     return lambda: problem.designs(0.25, degree=3, tolerance=1e-6)

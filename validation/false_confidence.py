@@ -56,7 +56,7 @@ from wallmirror.derendering.elimination import restricted
 from wallmirror.derendering.foresight import closest_spline
 from wallmirror.derendering.moments import moments
 from wallmirror.derendering.options import SolveOptions
-from wallmirror.derendering.problem import prepare
+from wallmirror.derendering.preparing import prepare
 from wallmirror.files import write_atomically
 
 WallModel = Literal["angle_sum", "microfacet", "auto"]

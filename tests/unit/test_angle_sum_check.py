@@ -22,7 +22,8 @@ from wallmirror.derendering.facet_fit import fit_facets
 from wallmirror.derendering.facets import EVERY, FITTED, weighted
 from wallmirror.derendering.nested import NOISY_STEPS
 from wallmirror.derendering.noisy import solve_noisy
-from wallmirror.derendering.problem import Problem, prepare
+from wallmirror.derendering.preparing import prepare
+from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.solve import solve
 from wallmirror.transport import build_kernel, radiance, transport_matrix
 

@@ -22,7 +22,8 @@ from wallmirror.derendering.facet_fit import settle_wall
 from wallmirror.derendering.facets import FITTED, weighted
 from wallmirror.derendering.gauge import Gauge
 from wallmirror.derendering.noisy import solve_noisy
-from wallmirror.derendering.problem import Problem, prepare
+from wallmirror.derendering.preparing import prepare
+from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.solve import solve
 from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card, Observer, scan_angles

@@ -16,7 +16,7 @@ from wallmirror.derendering.groups import one_group
 from wallmirror.derendering.knots import Level
 from wallmirror.derendering.likelihood import Fit
 from wallmirror.derendering.moments import moments
-from wallmirror.derendering.problem import prepare
+from wallmirror.derendering.preparing import prepare
 from wallmirror.derendering.solve import solve
 from wallmirror.derendering.subspace import closed_form
 from wallmirror.errors import UndeterminedError

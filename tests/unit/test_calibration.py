@@ -14,7 +14,7 @@ from wallmirror.brdf import AngleSumBRDF
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering.calibration import Calibration, Parameter, calibrate, moved
 from wallmirror.derendering.calibration_films import Films, Point
-from wallmirror.derendering.problem import prepare
+from wallmirror.derendering.preparing import prepare
 from wallmirror.derendering.solve import solve
 from wallmirror.errors import UndeterminedError
 from wallmirror.geometry import Card, Observer

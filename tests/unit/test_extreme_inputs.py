@@ -16,8 +16,7 @@ import pytest
 import wallmirror as wm
 from wallmirror.cli import main
 from wallmirror.comparison import compare
-from wallmirror.derendering import bounds, counting, poisson
-from wallmirror.derendering import problem as solver_problem
+from wallmirror.derendering import bounds, counting, poisson, preparing
 from wallmirror.derendering.calibration import moved
 from wallmirror.derendering.general import solve_general
 from wallmirror.derendering.likelihood import moments
@@ -99,8 +98,8 @@ def test_a_pixel_drowned_in_noise_is_as_one_without_weight(variance, monkeypatch
     assert found.verdict == "good"
     assert wm.scale_free_error(found.source, source) < 5 * found.predicted_error
     # The twin: let such noise count, and its floor takes all others.
-    monkeypatch.setattr(solver_problem, "_DEAF", math.inf)
-    monkeypatch.setattr(solver_problem.np, "median", lambda _: math.inf)
+    monkeypatch.setattr(preparing, "_DEAF", math.inf)
+    monkeypatch.setattr(preparing.np, "median", lambda _: math.inf)
     assert_undetermined(lambda: wm.solve(drowned))
 
 

@@ -18,7 +18,7 @@ from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.facets import weighted
 from wallmirror.derendering.groups import Groups, groups_of, one_group
 from wallmirror.derendering.noisy import solve_noisy
-from wallmirror.derendering.problem import prepare
+from wallmirror.derendering.preparing import prepare
 from wallmirror.derendering.solve import solve
 from wallmirror.derendering.splines import design_matrices, grid_for
 from wallmirror.geometry import Card

@@ -26,7 +26,7 @@ from wallmirror.derendering.ladder import Ladder
 from wallmirror.derendering.light import Lit, Missed, missed_in_the_light
 from wallmirror.derendering.likelihood import ROUGH, Fit, finished, maximise, moments
 from wallmirror.derendering.nested import NOISY_STEPS
-from wallmirror.derendering.problem import prepare
+from wallmirror.derendering.preparing import prepare
 from wallmirror.derendering.solve import solve
 from wallmirror.derendering.splines import SplineGrid, design_matrices, grid_for
 from wallmirror.derendering.subspace import banded_gram

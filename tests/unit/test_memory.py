@@ -12,8 +12,8 @@ import pytest
 from wallmirror import memory
 from wallmirror.brdf import Mirror
 from wallmirror.captures import CaptureSet
-from wallmirror.derendering import problem, splines
-from wallmirror.derendering.problem import prepare
+from wallmirror.derendering import preparing, splines
+from wallmirror.derendering.preparing import prepare
 from wallmirror.derendering.solve import solve
 from wallmirror.geometry import Card, Observer
 from wallmirror.pathtracing.filming import render_captures, render_one_hot
@@ -158,7 +158,7 @@ def test_captures_too_large_to_solve_are_refused(monkeypatch: pytest.MonkeyPatch
     assert "a solution from 4 views x 500 pixels x 20 realisations needs 24.3 MB" in str(
         refused(lambda: prepare(captures))
     )
-    monkeypatch.setattr(problem, "require_memory", lambda needed, what: None)
+    monkeypatch.setattr(preparing, "require_memory", lambda needed, what: None)
     prepare(captures)  # the twin
 
 

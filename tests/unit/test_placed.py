@@ -20,7 +20,8 @@ from wallmirror.derendering.bounds import Bound, cramer_rao
 from wallmirror.derendering.calibration import Calibration, calibrate, moved
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.moments import moments
-from wallmirror.derendering.problem import Problem, prepare
+from wallmirror.derendering.preparing import prepare
+from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.solve import solve
 from wallmirror.derendering.splines import SplineGrid, design_matrices
 from wallmirror.geometry import Card

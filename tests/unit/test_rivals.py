@@ -15,7 +15,7 @@ from wallmirror.brdf import CookTorrance, Fresnel
 from wallmirror.captures import CaptureSet
 from wallmirror.derendering import scarce, stages
 from wallmirror.derendering.few_captures import FewCaptures, few_captures
-from wallmirror.derendering.problem import prepare
+from wallmirror.derendering.preparing import prepare
 from wallmirror.derendering.rivals import LEVEL, better_by_chance
 from wallmirror.derendering.solution import Solution
 from wallmirror.derendering.solve import solve

@@ -19,7 +19,7 @@ from wallmirror.derendering.components import components
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.exact import solve_exactly
 from wallmirror.derendering.options import Method
-from wallmirror.derendering.problem import prepare
+from wallmirror.derendering.preparing import prepare
 from wallmirror.derendering.solution import Solution
 from wallmirror.derendering.solve import solve
 from wallmirror.geometry import Card, Observer

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from wallmirror.captures import CaptureSet
 from wallmirror.convolution.half_circle import HalfCircle
 from wallmirror.convolution.spherical import cosines, scene_angles
-from wallmirror.derendering.problem import prepare
+from wallmirror.derendering.preparing import prepare
 from wallmirror.derendering.subspace import ClosedForm, closed_form
 from wallmirror.errors import InputError, UndeterminedError
 from wallmirror.geometry import Card, Observer

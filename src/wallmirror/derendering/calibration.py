@@ -30,7 +30,8 @@ from wallmirror.captures import CaptureSet
 from wallmirror.derendering.calibration_films import Films, Found, Point, card_at, moved
 from wallmirror.derendering.calibration_fit import likeliest
 from wallmirror.derendering.calibration_search import search_card, settled
-from wallmirror.derendering.problem import Problem, prepare
+from wallmirror.derendering.preparing import prepare
+from wallmirror.derendering.problem import Problem
 from wallmirror.errors import InputError, UndeterminedError
 from wallmirror.geometry import Card
 

@@ -13,7 +13,8 @@ from wallmirror.derendering.components import components, in_words, named
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.gauge import Gauge
 from wallmirror.derendering.one_bounce import OneBounceCheck
-from wallmirror.derendering.problem import ROUNDING, Problem, expected_mismatch
+from wallmirror.derendering.pattern_space import ROUNDING, expected_mismatch
+from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.solution import Solution
 from wallmirror.derendering.subspace import SignalSpace
 from wallmirror.errors import UndeterminedError

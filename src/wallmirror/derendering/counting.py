@@ -17,7 +17,8 @@ from wallmirror.derendering.knots import refine
 from wallmirror.derendering.nested import NOISY_STEPS
 from wallmirror.derendering.patterns import trusted_bound
 from wallmirror.derendering.poisson import maximise_poisson, poisson_bound
-from wallmirror.derendering.problem import Problem, prepare
+from wallmirror.derendering.preparing import prepare
+from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.subspace import SignalSpace
 from wallmirror.errors import InputError
 

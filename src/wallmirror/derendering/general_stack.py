@@ -12,14 +12,9 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from wallmirror.captures import CaptureSet
-from wallmirror.derendering.problem import (
-    Problem,
-    patterns_space,
-    prepare,
-    require_pixels,
-    require_realisations,
-    too_few_patterns,
-)
+from wallmirror.derendering.pattern_space import patterns_space, too_few_patterns
+from wallmirror.derendering.preparing import prepare, require_pixels, require_realisations
+from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form
 from wallmirror.derendering.tables import TableGrid

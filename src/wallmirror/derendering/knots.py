@@ -22,7 +22,8 @@ from wallmirror.derendering.information import Information, information
 from wallmirror.derendering.ladder import SPARE, Ladder
 from wallmirror.derendering.likelihood import Fit, finished
 from wallmirror.derendering.moments import Moments
-from wallmirror.derendering.problem import Problem, expected_mismatch, too_few_patterns
+from wallmirror.derendering.pattern_space import expected_mismatch, too_few_patterns
+from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import SplineGrid
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace
 from wallmirror.errors import InputError, UndeterminedError

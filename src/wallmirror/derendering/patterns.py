@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from wallmirror.derendering.bounds import Bound
 from wallmirror.derendering.knots import Level
-from wallmirror.derendering.problem import Problem, too_few_patterns
+from wallmirror.derendering.pattern_space import too_few_patterns
+from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import exposures
 from wallmirror.derendering.subspace import CERTAIN, LIKELY, POSSIBLE, noise_edge
 

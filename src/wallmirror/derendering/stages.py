@@ -24,7 +24,9 @@ from wallmirror.derendering.nested import NOISY_STEPS
 from wallmirror.derendering.noisy import solve_noisy
 from wallmirror.derendering.one_bounce import check_one_bounce
 from wallmirror.derendering.options import Method
-from wallmirror.derendering.problem import ROUNDING, Problem, expected_mismatch, prepare
+from wallmirror.derendering.pattern_space import ROUNDING, expected_mismatch
+from wallmirror.derendering.preparing import prepare
+from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.rivals import hold_against_rivals
 from wallmirror.derendering.scarce import refit_scarce, solve_scarce
 from wallmirror.derendering.subspace import SignalSpace

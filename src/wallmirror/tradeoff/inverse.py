@@ -18,7 +18,7 @@ from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.few_captures import few_captures
 from wallmirror.derendering.foresight import foresee
 from wallmirror.derendering.likelihood import maximise, moments
-from wallmirror.derendering.problem import prepare
+from wallmirror.derendering.preparing import prepare
 from wallmirror.derendering.solve import solve
 from wallmirror.derendering.subspace import closed_form
 from wallmirror.derendering.unstructured import de_render_unstructured
