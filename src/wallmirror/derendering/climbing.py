@@ -76,7 +76,7 @@ class _Climber:
     ladder: Ladder
     nonnegative: bool
     tell: Tell
-    missed: dict[int, Missed | None] = field(default_factory=dict)
+    missed: dict[int, Missed] = field(default_factory=dict)
 
     def fit(self, index: int, *starts: Array) -> Fit:
         """The free fit, as near to its maximum as knots are compared at."""
@@ -89,10 +89,13 @@ class _Climber:
         ladder, rival = self.ladder, None
         finer_fits: dict[int, Fit] = {}
         while index > 0 and (foretold := self._coarser(index, best)) is not None:
-            if self.nonnegative and index >= ladder.last - 1 and self._lit_pays(index, best):
+            nearest, lost = foretold
+            narrow = self.nonnegative and index >= ladder.last - 1
+            pays = self._lit_pays(index, best, lost) if narrow else False
+            if pays:
                 break
             finer_fits[index] = best
-            coarser = self.fit(index - 1, foretold, ladder.coarsened(index, best.coefficients))
+            coarser = self.fit(index - 1, nearest, ladder.coarsened(index, best.coefficients))
             if coarser.objective - best.objective > _HOPELESS * ladder.price(index - 1, index, best):
                 # So much was not foretold: what is nearest where the captures look led to another maximum.
                 again = self.fit(index - 1, ladder.closed(index - 1).coefficients)
@@ -100,6 +103,8 @@ class _Climber:
             # Against each of the finer ones: steps of which none loses much may lose much together.
             losses = ((finer, each, coarser.objective - each.objective) for finer, each in finer_fits.items())
             if any(loss >= ladder.price(index - 1, finer, each) for finer, each, loss in losses):
+                break
+            if pays is None and self._in_the_light(index - 1, coarser, index) is not None:
                 break
             rival = Other(best.source, best.objective)
             index, best = index - 1, coarser
@@ -131,8 +136,8 @@ class _Climber:
                 break
         return fits, rival
 
-    def _coarser(self, index: int, fit: Fit) -> Array | None:
-        """The next coarser knots' r that is foretold to be their best; None if it misses so much that no fit is called for."""
+    def _coarser(self, index: int, fit: Fit) -> tuple[Array, float] | None:
+        """The next coarser knots' r that is foretold to be their best, and its loss; None if that is too much for a fit."""
         ladder, summed = self.ladder, self.ladder.summed(index)
         halved = sp.csr_array(ladder.grids[index - 1].in_halved()[summed.seen])
         schur = information(summed, fit.coefficients, fit.source).schur if fit.schur is None else fit.schur
@@ -142,7 +147,7 @@ class _Climber:
         saved = max(1, halved.shape[0] - int(np.count_nonzero(halved.sum(axis=0))))
         many = _POOR if lost < _SMALL * float(np.sum(summed.energy)) else _HOPELESS
         if lost < many * worth(saved, freedom) * ladder.variance(fit.objective, freedom):
-            return nearest
+            return nearest, lost
         self.tell(f"{self._knots(index - 1)} would raise it by about {lost:.4g}")
         return None
 
@@ -167,11 +172,14 @@ class _Climber:
             other = self._stepped(finer, start + found.step)
         if not self.nonnegative:
             return None, other
+        pays = None
         if tried is not None and finer == index + 1:
-            taken = tried if self._lit_pays(finer, tried) else None
-        else:
+            pays = self._lit_pays(finer, tried, best.objective - tried.objective)
+        if pays is None:
             lit = self._in_the_light(index, best, finer)
             taken = None if lit is None else tried or self.fit(finer, start + lit.step, start)
+        else:
+            taken = tried if pays else None
         return taken, other if taken is None else Other(taken.source, taken.objective)
 
     def _in_the_light(self, index: int, best: Fit, finer: int) -> Finer | None:
@@ -186,15 +194,21 @@ class _Climber:
         found, price = self._tested(index, within, finer, lit.fine, lit.used)
         return found if found.gain >= price else None
 
-    def _lit_pays(self, index: int, fit: Fit) -> bool:
-        """Whether the next coarser knots miss more of a free fit in the light than noise makes of it."""
-        if index not in self.missed:
-            self.missed[index] = missed_in_the_light(self.ladder, index, fit)
-        missed = self.missed[index]
+    def _lit_pays(self, index: int, fit: Fit, lost: float) -> bool | None:
+        """Whether the knots before those of a free fit miss more in the light than noise makes of it.
+
+        None if that cannot be told, as no rho >= 0 was found on them that comes near: within the bounds they miss no more
+        than without, which is `lost`.
+        """
+        ladder = self.ladder
+        missed = missed_in_the_light(ladder, index, fit)
         if missed is None:
             return False
+        if missed.rise * ladder.variance(fit.objective, missed.freedom) > lost:
+            return None
+        self.missed[index] = missed
         noise = f"of which noise makes up to {missed.price:.4g}"
-        self.tell(f"{self._knots(index - 1)} miss {missed.loss:.4g} of it in the light, {noise}")
+        self.tell(f"{self._knots(index - 1)} miss {missed.loss:.4g} in the light, {noise}")
         return missed.loss >= missed.price
 
     def _paying(self, index: int, best: Fit, finer: int, trial: Fit) -> tuple[Fit | None, Other]:

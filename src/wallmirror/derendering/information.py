@@ -80,13 +80,6 @@ def information(data: Moments, coefficients: Array, source: Array, schur: Array 
     return Information(schur, inverse, coupled, seen)
 
 
-def schur_on(data: Moments, coefficients: Array, source: Array, cells: NDArray[np.intp]) -> Array:
-    """S at r (K,) and V (M, B) on some coefficients, as if the others were known."""
-    point = point_at(data, coefficients, source.T)
-    free = np.ones_like(point.v, dtype=bool)
-    return schur_complement(data, point, free, inverses(data, point, free), cells)
-
-
 def point_at(data: Moments, r: Array, v: Array | None = None, *, nonnegative: bool = False) -> Point:
     """The point with r (K,), and with the pattern v (B, M) or, where none is given, the best one, V >= 0 if need be."""
     m = data.elements
@@ -166,6 +159,16 @@ def schur_complement(
         half = (root.transpose(0, 2, 1) @ _coupling(data, point)[bound][..., kept]).reshape(-1, cells.size)
         schur -= half.T @ half
     return schur
+
+
+def score_of(data: Moments, point: Point, cells: NDArray[np.intp]) -> tuple[Array, Array]:
+    """S on the given cells, and half the slope of the misfit there, with V >= 0 eliminated: shapes (n, n) and (n,)."""
+    pull_v = point.moment - np.einsum("bij,bj->bi", point.normal[data.group], point.v)
+    free = (point.v > 0) | (pull_v > 0)
+    inverse = inverses(data, point, free)
+    eliminated = np.einsum("bij,bj->bi", inverse, np.where(free, pull_v, 0.0))
+    pull_r = np.einsum("bi,bik->k", point.v, data.cross) - mixed(data, point, point.v) - mixed(data, point, eliminated)
+    return schur_complement(data, point, free, inverse, cells), pull_r[cells]
 
 
 def _coupling(data: Moments, point: Point) -> Array:

@@ -8,11 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from wallmirror.derendering.finer import loss, worth
-from wallmirror.derendering.information import schur_on
+from wallmirror.derendering.convex import solve_positive
+from wallmirror.derendering.finer import worth
+from wallmirror.derendering.information import point_at, score_of
 from wallmirror.derendering.ladder import Ladder
 from wallmirror.derendering.likelihood import Fit, best_nonnegative
 
@@ -25,6 +25,7 @@ _WELL_SEEN = 1e-3
 _SPARSE = 0.5
 # Share of the squared error of splines that halving their knots leaves at most, where rho has kinks but no jumps.
 _KINK = 1 / 8
+_RIDGE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -55,12 +56,14 @@ class Lit:
 
 @dataclass(frozen=True)
 class Missed:
-    """What coarser knots miss of a fit on the next finer ones in the light.
+    """What coarser knots miss in the light, where the next finer ones are fitted.
 
     Parameters
     ----------
     loss:
-        The rise of the misfit, in units of the noise.
+        What the finer ones would gain there, in units of the noise, but no more than at all angles.
+    rise:
+        By how much the misfit is higher on the coarser knots at all angles, at most.
     added:
         How many coefficients the finer knots have more.
     freedom:
@@ -68,6 +71,7 @@ class Missed:
     """
 
     loss: float
+    rise: float
     added: int
     freedom: int
 
@@ -87,22 +91,34 @@ class Missed:
 
 
 def missed_in_the_light(ladder: Ladder, finer: int, fit: Fit) -> Missed | None:
-    """What the next coarser knots miss of a free fit where rho >= 0 is lit, as far as the misfit is quadratic.
+    """What the next coarser knots miss of the films where rho >= 0 is lit, and finer ones would gain.
 
-    None where most of the angles are lit.
+    The score test of `finer` in the space of coefficients, from a rho >= 0 on the coarser knots that comes next to their
+    maximum within the bounds: the best one for the V of that on the finer knots. None where most of the angles are lit.
+
+    Parameters
+    ----------
+    finer, fit:
+        Index of the finer knots, and the free fit on them.
     """
-    summed, halved = ladder.summed(finer), ladder.grids[finer - 1].in_halved()
-    coarse = best_nonnegative(summed, fit.source, halved)
+    summed, halved, within = ladder.summed(finer), ladder.grids[finer - 1].in_halved(), ladder.bounded(finer, fit)
+    coarse = best_nonnegative(summed, within.source, halved)
     lit = Lit.of(ladder, finer - 1, coarse, finer)
     if lit is None:
         return None
-    within = ladder.bounded(finer, fit)
+    point = point_at(summed, halved @ coarse, nonnegative=True)
     cells = np.flatnonzero(lit.fine & summed.seen)
-    schur = schur_on(summed, within.coefficients, within.source, cells)
-    pull = np.einsum("ib,bik->k", within.source, summed.cross)[cells]
-    # What dark coefficients have a part in beside the lit ones is not for these to make up for.
-    whole = halved @ coarse
-    dark = halved @ np.where(lit.coarse, 0.0, coarse) * (within.coefficients @ whole / (whole @ whole))
-    lost, _ = loss(schur, (within.coefficients - dark)[cells], pull, sp.csr_array(halved[cells][:, lit.coarse]))
+    schur, pull = score_of(summed, point, cells)
+    schur[np.diag_indices_from(schur)] += _RIDGE * np.trace(schur) / max(1, cells.size)
+    own = halved[cells][:, lit.coarse]
+    # Less what is left to gain on the coarser knots themselves.
+    gain = _gain(schur, pull) - _gain(own.T @ schur @ own, own.T @ pull)
     freedom = ladder.freedom(finer)
-    return Missed(lost / ladder.variance(fit.objective, freedom), max(1, cells.size - lit.used), freedom)
+    unit = ladder.variance(fit.objective, freedom)
+    rise = (point.objective - within.objective) / unit
+    return Missed(min(gain / unit, rise), rise, max(1, cells.size - lit.used), freedom)
+
+
+def _gain(curvature: Array, pull: Array) -> float:
+    """The fall of the misfit that a Newton step promises."""
+    return float(pull @ solve_positive(curvature, pull))

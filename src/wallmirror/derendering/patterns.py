@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from wallmirror.derendering.bounds import Bound
 from wallmirror.derendering.knots import Level
+from wallmirror.derendering.likelihood import Fit
 from wallmirror.derendering.pattern_space import too_few_patterns
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import exposures
@@ -70,13 +71,15 @@ def trusted_bound(
     elements = source.shape[0]
     triangle = np.linalg.qr(problem.row_weights * transport, mode="r")
     left, strength, right = np.linalg.svd(triangle @ source, full_matrices=False)
-    size = (transport.shape[0], source.shape[1], free_coefficients(problem, level, source, sigma))
-    certain = standing_out(strength / sigma, *size)
-    if certain == elements:
-        return bound, ()
+    # Free coefficients that a climb held are smaller than those of the maximum, and more of them count as free.
+    for free in (level.free, level.settled):
+        size = (transport.shape[0], source.shape[1], free_coefficients(problem, level, free, source, sigma))
+        certain = standing_out(strength / sigma, *size)
+        if certain == elements:
+            return bound, ()
     # Bounds weaken patterns, false ones and true ones. What noise makes of one is known without them alone.
-    free = np.stack([t @ level.free.coefficients for t in level.designs], axis=1)
-    unbounded = np.linalg.svd(np.linalg.qr(problem.row_weights * free, mode="r") @ level.free.source, compute_uv=False)
+    films = np.stack([t @ free.coefficients for t in level.designs], axis=1)
+    unbounded = np.linalg.svd(np.linalg.qr(problem.row_weights * films, mode="r") @ free.source, compute_uv=False)
     certain = max(certain, standing_out(unbounded / sigma, *size))
     possible = standing_out(unbounded / sigma, *size, units=POSSIBLE)
     if possible < elements:
@@ -109,11 +112,11 @@ def standing_out(strength: Array, rows: int, realisations: int, free: int, units
     return int(below[0]) if below.size else elements
 
 
-def free_coefficients(problem: Problem, level: Level, source: Array, sigma: float) -> int:
+def free_coefficients(problem: Problem, level: Level, free: Fit, source: Array, sigma: float) -> int:
     """Most coefficients of rho that would be free, were one element dark: those that the others hardly show."""
     pairs = level.summed.pairs
     alone = pairs[0].exposures if len(pairs) == 1 else exposures(level.designs, np.square(problem.row_weights[:, 0]))
     shown = alone * np.sum(source * source, axis=1)[:, None]
     by_others = (np.sum(shown, axis=0) - shown)[:, level.summed.seen]
-    largest = float(np.max(np.abs(level.free.coefficients)))
+    largest = float(np.max(np.abs(free.coefficients)))
     return int(np.max(np.count_nonzero(by_others < (sigma / (_FREE * largest)) ** 2, axis=1)))
