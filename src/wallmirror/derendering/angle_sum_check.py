@@ -109,8 +109,8 @@ def check_angle_sum(problem: Problem, estimate: Estimate, factors: tuple[Factor,
     full = np.broadcast_to(weights, problem.data.shape)
     missed = problem.data - estimate.transport @ estimate.source
     weighted = [weights * a for a in unexplained]
-    gram = np.array([[np.sum(a * b) for b in unexplained] for a in weighted])
-    by_row = np.array([np.sum(a * missed, axis=1) for a in weighted])
+    gram = np.array([[np.vdot(a, b) for b in unexplained] for a in weighted])
+    by_row = np.array([np.einsum("pb,pb->p", a, missed) for a in weighted])
     used = full > 0
     observations, rows = int(np.count_nonzero(used)), int(np.count_nonzero(np.any(used, axis=1)))
     freedom = max(1, observations - int(np.count_nonzero(estimate.coefficients)) - estimate.source.size)

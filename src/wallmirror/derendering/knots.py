@@ -20,7 +20,7 @@ from wallmirror.derendering.finer import worth
 from wallmirror.derendering.groups import Groups
 from wallmirror.derendering.information import Information, information
 from wallmirror.derendering.ladder import SPARE, Ladder
-from wallmirror.derendering.likelihood import Fit, finished, maximise
+from wallmirror.derendering.likelihood import ROUGH, Fit, finished, maximise
 from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.pattern_space import expected_mismatch, too_few_patterns
 from wallmirror.derendering.problem import Problem
@@ -81,7 +81,8 @@ class Level:
     def settled(self) -> Fit:
         """The free maximum itself, with whatever coefficients noise throws about."""
         try:
-            return maximise(self.summed, self.free.coefficients, nonnegative=False, schur=self.free.schur)
+            r, schur = self.free.coefficients, self.free.schur
+            return maximise(self.summed, r, nonnegative=False, tolerance=ROUGH, schur=schur)
         except UndeterminedError:
             return self.free
 

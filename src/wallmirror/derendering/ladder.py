@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from wallmirror.derendering.finer import worth
 from wallmirror.derendering.groups import Groups, closed_form_in_groups, groups_of
-from wallmirror.derendering.likelihood import ROUGH, Fit, best_nonnegative, maximise
+from wallmirror.derendering.likelihood import ROUGH, Fit, best_nonnegative, bounded, maximise
 from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.nested import FINEST_QUADRATURE, Nested
 from wallmirror.derendering.problem import Problem
@@ -141,7 +141,7 @@ class Ladder:
         """
         if index not in self._begun:
             summed = self.summed(index)
-            self._begun[index] = maximise(summed, best_nonnegative(summed, source))
+            self._begun[index] = bounded(summed, best_nonnegative(summed, source))
         return self._begun[index]
 
     def bounded(self, index: int, free: Fit) -> Fit:
@@ -159,7 +159,7 @@ class Ladder:
             for start in starts:
                 if best is not None and self.agrees(index, free, best):
                     break
-                found = maximise(summed, start())
+                found = bounded(summed, start())
                 best = found if best is None else min(best, found, key=lambda fit: fit.objective)
             assert best is not None
             self._bounded[index] = best

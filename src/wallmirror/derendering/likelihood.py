@@ -26,15 +26,15 @@ from wallmirror.derendering.information import Point, inverses, mixed, point_at,
 from wallmirror.derendering.moments import Moments, moments
 from wallmirror.errors import UndeterminedError
 
-__all__ = ["ROUGH", "Fit", "Moments", "best_nonnegative", "finished", "maximise", "moments"]
+__all__ = ["ROUGH", "Fit", "Moments", "best_nonnegative", "bounded", "finished", "maximise", "moments"]
 
 Array = NDArray[np.float64]
 
 # Cells seen less than this relative to the best-seen one are weak: noise rules them in a start.
 _WEAK = 1e-4
 _RIDGE = 1e-12
-# Share of the misfit by which a full step may still lower it; and, of a datum's noise, what one may gain at the end of a climb
-# that is held back: a tenth turns the pattern by no more than a third of an error bar, if all of it lies in one direction.
+# Share of the misfit by which a full step may still lower it; and, of a datum's noise, what one may gain where error bars are
+# all that counts: a tenth turns the pattern by no more than a third of one, if all of it lies in one direction.
 _TOLERANCE, _TENTH = 1e-7, 0.1
 #: The share between knots, where a fit need not be finer.
 ROUGH = 1e-5
@@ -172,8 +172,16 @@ def maximise(
 
 def finished(data: Moments, fit: Fit) -> Fit:
     """The maximum without bounds as far as the captures see it, from a fit that came near it."""
-    tolerance = min(ROUGH, _TENTH / max(1, data.observations))
-    return maximise(data, fit.coefficients, nonnegative=False, tolerance=tolerance, held=True, schur=fit.schur)
+    return maximise(data, fit.coefficients, nonnegative=False, tolerance=_near_enough(data), held=True, schur=fit.schur)
+
+
+def bounded(data: Moments, start: Array) -> Fit:
+    """The maximum within the bounds, as near as error bars call for."""
+    return maximise(data, start, tolerance=_near_enough(data))
+
+
+def _near_enough(data: Moments) -> float:
+    return min(ROUGH, _TENTH / max(1, data.observations))
 
 
 def best_nonnegative(data: Moments, source: Array, halved: sp.csr_array | None = None) -> Array:

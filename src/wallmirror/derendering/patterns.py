@@ -71,12 +71,19 @@ def trusted_bound(
     elements = source.shape[0]
     triangle = np.linalg.qr(problem.row_weights * transport, mode="r")
     left, strength, right = np.linalg.svd(triangle @ source, full_matrices=False)
-    # Free coefficients that a climb held are smaller than those of the maximum, and more of them count as free.
-    for free in (level.free, level.settled):
+
+    def certainly(free: Fit) -> tuple[int, tuple[int, int, int]]:
+        """How many patterns are, and the size of the noise that might have made others."""
         size = (transport.shape[0], source.shape[1], free_coefficients(problem, level, free, source, sigma))
-        certain = standing_out(strength / sigma, *size)
-        if certain == elements:
-            return bound, ()
+        return standing_out(strength / sigma, *size), size
+
+    # Coefficients that the climb held are smaller than at the maximum itself, where fewer count as free.
+    certain, size = certainly(level.free)
+    if certain < elements:
+        certain, size = certainly(level.settled)
+    if certain == elements:
+        return bound, ()
+    free = level.settled
     # Bounds weaken patterns, false ones and true ones. What noise makes of one is known without them alone.
     films = np.stack([t @ free.coefficients for t in level.designs], axis=1)
     unbounded = np.linalg.svd(np.linalg.qr(problem.row_weights * films, mode="r") @ free.source, compute_uv=False)
