@@ -35,7 +35,7 @@ from wallmirror.derendering.groups import groups_of, one_group
 from wallmirror.derendering.information import information
 from wallmirror.derendering.moments import moments
 from wallmirror.derendering.problem import Problem
-from wallmirror.derendering.splines import design_matrices
+from wallmirror.derendering.splines import design_matrices, transport_of
 
 Array = NDArray[np.float64]
 
@@ -196,7 +196,7 @@ def _derivatives(
     unexplained, turns = [], []
     for change, along, dr in zip(changes, along_v, steps, strict=True):
         dv = (np.einsum("bij,bj->bi", known.inverse, along) - np.einsum("bmk,k->bm", known.coupled, dr[cells])).T
-        moved = np.stack([t @ dr for t in designs], axis=1)
+        moved = transport_of(designs, dr)
         unexplained.append((change - moved) @ source - estimate.transport @ dv)
         turns.append(-groups.freed(dv, source))  # a change of scale is no turn
     return unexplained, turns

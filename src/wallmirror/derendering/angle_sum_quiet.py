@@ -26,6 +26,7 @@ from wallmirror.derendering.angle_sum_check import AngleSumCheck
 from wallmirror.derendering.estimate import Estimate
 from wallmirror.derendering.facets import FITTED, PRIOR_STD, Factor, logarithm
 from wallmirror.derendering.problem import Problem
+from wallmirror.derendering.splines import transport_of
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form
 from wallmirror.geometry import incident_angles, outgoing_angles, wall_points
 
@@ -121,7 +122,7 @@ def _at(problem: Problem, designs: list[sp.csr_array], space: SignalSpace) -> tu
 
 def _missed(closed: ClosedForm, designs: list[sp.csr_array], space: SignalSpace) -> Array:
     """What lies of F with |F| = 1 outside the data's space, (P, M)."""
-    transport = np.stack([t @ closed.coefficients for t in designs], axis=1)
+    transport = transport_of(designs, closed.coefficients)
     outside = transport - space.basis @ (space.basis.T @ transport)
     return np.asarray(outside / max(float(np.linalg.norm(transport)), 1e-300))
 

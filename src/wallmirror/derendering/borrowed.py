@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from wallmirror.derendering.knots import Level
 from wallmirror.derendering.problem import Problem
+from wallmirror.derendering.splines import transport_of
 from wallmirror.errors import UndeterminedError
 
 Array = NDArray[np.float64]
@@ -85,7 +86,7 @@ def borrowed_share(problem: Problem, level: Level, sigma: float) -> float:
     adds, mixed = np.linalg.eigh(root.T @ beside @ root)
     noises = (root @ mixed[:, ::-1])[:, :_CARRYING].T
     rest = float(np.sum(adds[: max(0, adds.size - _CARRYING)]))
-    transport = np.stack([t @ level.fit.coefficients for t in level.designs], axis=1)
+    transport = transport_of(level.designs, level.fit.coefficients)
     return unit * (rest + sum(_beyond(problem, level, transport, noise, dv) for noise in noises))
 
 
@@ -99,7 +100,7 @@ def _beyond(problem: Problem, level: Level, transport: Array, noise: Array, dv: 
     known, designs = level.information, level.designs
     whole = np.zeros(known.seen.size)
     whole[known.seen] = noise
-    films = np.stack([t @ whole for t in designs], axis=1) @ dv
+    films = transport_of(designs, whole) @ dv
     weighted = problem.fit_weights * films
     by_v = transport.T @ weighted  # F^T W b of each realisation
     made = np.einsum("bij,jb->ib", known.inverse, by_v)

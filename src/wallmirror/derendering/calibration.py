@@ -30,6 +30,7 @@ from wallmirror.captures import CaptureSet
 from wallmirror.derendering.calibration_films import Films, Found, Point, card_at, moved
 from wallmirror.derendering.calibration_fit import likeliest
 from wallmirror.derendering.calibration_search import search_card, settled
+from wallmirror.derendering.pattern_space import NOISELESS
 from wallmirror.derendering.preparing import prepare
 from wallmirror.derendering.problem import Problem
 from wallmirror.errors import InputError, UndeterminedError
@@ -43,8 +44,6 @@ Parameter = Literal["x", "y", "width"]
 
 _NAMES: tuple[Parameter, ...] = get_args(Parameter)
 _WORDS = {"x": "offset", "y": "distance", "width": "width"}
-# As in `stages`: below this mismatch there is no noise.
-_NOISELESS = 1e-15
 # A standard deviation of this share of the distance (or of the width) means that the captures know nothing of it.
 _UNTOLD = 0.3
 
@@ -125,7 +124,7 @@ def calibrate(
     with threadpool_limits(limits=1, user_api="blas"):
         problem, _ = prepare(captures)
         nearest, reach = search_card(problem, free, search, tell)
-        if problem.noise_is_stated or nearest.closed.mismatch > _NOISELESS:
+        if problem.noise_is_stated or nearest.closed.mismatch > NOISELESS:
             result = likeliest(problem, free, nearest, reach, tell)
         else:
             result = settled(nearest, free)

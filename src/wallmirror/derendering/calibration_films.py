@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from wallmirror.derendering.problem import Problem
-from wallmirror.derendering.splines import SplineGrid, design_matrices
+from wallmirror.derendering.splines import SplineGrid, design_matrices, transport_of
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, banded_gram, closed_form, signal_space
 from wallmirror.errors import InputError
 from wallmirror.geometry import Card
@@ -193,7 +193,7 @@ class Point:
         u, r = self.films.space.basis, self.closed.coefficients
         slopes = self.films.weight * self.films.slopes(self.g, free, self.grid, r, central=central)
         beyond = slopes - u @ (u.T @ slopes)
-        columns = np.stack([t @ r for t in self.designs], axis=1)  # sum of squares 1
+        columns = transport_of(self.designs, r)  # sum of squares 1
         gradient = np.einsum("jpm,pm->j", slopes, columns - u @ (u.T @ columns) - self.mismatch * columns)
         cross = np.zeros((r.size, len(free)))
         along = np.zeros(r.size)

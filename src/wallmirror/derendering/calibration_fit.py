@@ -17,7 +17,7 @@ from wallmirror.derendering.bounds import cramer_rao
 from wallmirror.derendering.calibration_films import Films, Found, Point
 from wallmirror.derendering.likelihood import Fit, maximise, moments
 from wallmirror.derendering.problem import Problem
-from wallmirror.derendering.splines import SplineGrid, design_matrices
+from wallmirror.derendering.splines import SplineGrid, design_matrices, transport_of
 from wallmirror.derendering.subspace import closed_form
 from wallmirror.errors import UndeterminedError
 
@@ -110,7 +110,7 @@ def _noise(problem: Problem, designs: list[sp.csr_array], fit: Fit) -> tuple[flo
     """Noise variance in units of the weights, and the misfit over what any rank-M model would leave."""
     rows, realisations = problem.data.shape
     elements = len(designs)
-    transport = np.stack([t @ fit.coefficients for t in designs], axis=1)
+    transport = transport_of(designs, fit.coefficients)
     weights = problem.inverse_variance if problem.inverse_variance is not None else np.ones(1)
     counted = np.where(problem.noisy, weights * (problem.data - transport @ fit.source) ** 2, 0.0)
     parameters = int(np.count_nonzero(fit.coefficients)) + fit.source.size

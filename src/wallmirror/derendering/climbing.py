@@ -19,6 +19,7 @@ from wallmirror.derendering.information import information
 from wallmirror.derendering.ladder import SPARE, Ladder
 from wallmirror.derendering.light import Lit, Missed, missed_in_the_light
 from wallmirror.derendering.likelihood import ROUGH, Fit, maximise
+from wallmirror.derendering.splines import transport_of
 from wallmirror.errors import UndeterminedError
 
 Array = NDArray[np.float64]
@@ -219,7 +220,7 @@ class _Climber:
     def _tested(self, index: int, fit: Fit, finer: int, free: NDArray[np.bool_], used: int) -> tuple[Finer, float]:
         """What finer knots gain and what they must, for coefficients free to move where `used` of the coarser were."""
         ladder, problem = self.ladder, self.ladder.problem
-        transport = np.stack([t @ fit.coefficients for t in ladder.designs(index)], axis=1)
+        transport = transport_of(ladder.designs(index), fit.coefficients)
         films = Films(problem.data, problem.fit_weights, transport, fit.source)
         freedom = ladder.freedom(index) - used
         enough = worth(int(np.count_nonzero(free)), freedom) * ladder.variance(fit.objective, freedom)
@@ -244,7 +245,7 @@ class _Climber:
     def _stepped(self, index: int, r: Array) -> Other:
         """Pattern and misfit at given coefficients, without a fit."""
         problem = self.ladder.problem
-        transport = np.stack([t @ r for t in self.ladder.designs(index)], axis=1)
+        transport = transport_of(self.ladder.designs(index), r)
         films = Films(problem.data, problem.fit_weights, transport, np.zeros((transport.shape[1], 1)))
         source = films.solved(films.data)
         return Other(source, Films(films.data, films.weights, transport, source).objective())

@@ -19,6 +19,7 @@ from wallmirror.derendering.patterns import trusted_bound
 from wallmirror.derendering.poisson import maximise_poisson, poisson_bound
 from wallmirror.derendering.preparing import prepare
 from wallmirror.derendering.problem import Problem
+from wallmirror.derendering.splines import transport_of
 from wallmirror.derendering.subspace import SignalSpace
 from wallmirror.errors import InputError
 
@@ -111,7 +112,7 @@ def solve_counts(
         )
 
     sigma = math.sqrt(max(1.0, fit.chi_squared))
-    transport = np.stack([t @ fit.coefficients for t in designs], axis=1)
+    transport = transport_of(designs, fit.coefficients)
     source = fit.source / unit
     bound, doubts = trusted_bound(
         problem, level, transport, source, sigma=sigma, bound=bound_at(source), bound_at=bound_at

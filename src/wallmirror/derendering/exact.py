@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from wallmirror.derendering.components import Separated, in_words, separate
 from wallmirror.derendering.estimate import Estimate, scale_free_error
 from wallmirror.derendering.problem import Problem
-from wallmirror.derendering.splines import SplineGrid
+from wallmirror.derendering.splines import SplineGrid, transport_of
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form
 from wallmirror.errors import UndeterminedError
 
@@ -88,7 +88,7 @@ def solve_exactly(problem: Problem, space: SignalSpace, *, step_deg: float | Non
             "off, and maximum likelihood would do better",
         )
     weights = problem.row_weights
-    transport = np.stack([t @ closed.coefficients for t in designs], axis=1)
+    transport = transport_of(designs, closed.coefficients)
     np.divide(closed.transport, weights, out=transport, where=weights > 0)
     peak_at = grid.peak(closed.coefficients, closed.exposure)
     peak = float(grid.evaluate(closed.coefficients, peak_at))
@@ -123,7 +123,7 @@ def _in_groups(problem: Problem, best: _Try, found: Separated) -> Estimate:
     grid, closed, designs = best.grid, best.closed, best.designs
     condition = float(np.linalg.cond(found.transport))
     error = max(math.sqrt(closed.mismatch) / max(closed.beyond, 1e-300) * condition, _ROUNDING * condition)
-    transport = np.stack([t @ found.coefficients for t in designs], axis=1)
+    transport = transport_of(designs, found.coefficients)
     spread = np.full(found.source.shape, error * float(np.sqrt(np.mean(found.source**2))))
     return Estimate(
         method="closed_form",

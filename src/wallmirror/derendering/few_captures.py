@@ -30,7 +30,7 @@ from wallmirror.derendering.ends import APART, ROUNDING, End, disagree, distinct
 from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.rivals import BARS, SAME, better_by_chance
-from wallmirror.derendering.splines import SplineGrid
+from wallmirror.derendering.splines import SplineGrid, transport_of
 from wallmirror.derendering.subspace import ClosedForm
 from wallmirror.errors import InputError, UndeterminedError
 
@@ -224,7 +224,7 @@ def _judged(
         designs=designs,
         coefficients=r,
         source=source,
-        transport=np.stack([t @ r for t in designs], axis=1),
+        transport=transport_of(designs, r),
         residual=residual,
         gap=flat / steepest,
         error=residual / flat,

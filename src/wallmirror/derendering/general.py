@@ -30,6 +30,7 @@ from wallmirror.derendering.estimate import scale_free_error
 from wallmirror.derendering.general_noisy import NOISY_STEPS, likeliest
 from wallmirror.derendering.general_solution import HOPELESS, GeneralSolution, status, too_few
 from wallmirror.derendering.general_stack import Stack, resolution
+from wallmirror.derendering.splines import transport_of
 from wallmirror.derendering.subspace import ClosedForm
 from wallmirror.derendering.tables import SplineTable, TableGrid
 from wallmirror.errors import InputError, UndeterminedError
@@ -169,13 +170,13 @@ def _polished(stack: Stack, designs: list[sp.csr_array], closed: ClosedForm) -> 
         return closed
     for _ in range(_PROXIMAL_STEPS):
         r = level * sl.cho_solve(factor, closed.coefficients, check_finite=False)
-        columns = np.stack([t @ r for t in weighted], axis=1)
+        columns = transport_of(weighted, r)
         norm = float(np.linalg.norm(columns))
         projected = u.T @ columns / norm
         mismatch = float(np.sum((columns / norm - u @ projected) ** 2))
         if not mismatch < 0.9 * closed.mismatch:
             break
-        source = np.linalg.lstsq(projected, u.T @ stack.problem.weighted_data)[0]
+        source = np.asarray(np.linalg.lstsq(projected, u.T @ stack.problem.weighted_data)[0], dtype=np.float64)
         closed = replace(closed, coefficients=r / norm, transport=u @ projected, source=source, mismatch=mismatch)
     return closed
 

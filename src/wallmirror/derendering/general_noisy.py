@@ -19,6 +19,7 @@ from wallmirror.derendering.estimate import doubts_of_fit
 from wallmirror.derendering.general_solution import HOPELESS, GeneralSolution, status, too_few
 from wallmirror.derendering.general_stack import Stack, exposure, resolution
 from wallmirror.derendering.likelihood import Fit, Moments, maximise, moments
+from wallmirror.derendering.splines import transport_of
 from wallmirror.derendering.subspace import ClosedForm
 from wallmirror.derendering.tables import SplineTable, TableGrid
 from wallmirror.errors import UndeterminedError
@@ -112,7 +113,7 @@ def _likeliest_solution(
     fit: Fit,
 ) -> GeneralSolution:
     problem = stack.problem
-    transport = np.stack([t @ fit.coefficients for t in designs], axis=1)
+    transport = transport_of(designs, fit.coefficients)
     weights = problem.inverse_variance if problem.inverse_variance is not None else np.ones(1)
     counted = np.where(problem.noisy, weights * (problem.data - transport @ fit.source) ** 2, 0.0)
     cells = int(np.count_nonzero(exposure(designs) > _SEEN))

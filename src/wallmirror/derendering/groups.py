@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from wallmirror.derendering.likelihood import Fit
-from wallmirror.derendering.splines import SplineGrid
+from wallmirror.derendering.splines import SplineGrid, transport_of
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, closed_form
 
 Array = NDArray[np.float64]
@@ -102,7 +102,7 @@ def closed_form_in_groups(data: Array, designs: list[sp.csr_array], space: Signa
     for form, mine in zip(forms, groups.cells, strict=True):
         r = np.where(mine, form.coefficients, 0.0)
         coefficients += r if form.exposure @ r > 0 else -r
-    transport = np.stack([t @ coefficients for t in designs], axis=1)
+    transport = transport_of(designs, coefficients)
     worst = max(forms, key=lambda form: form.mismatch)
     return ClosedForm(
         coefficients=coefficients,

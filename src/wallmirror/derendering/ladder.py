@@ -17,7 +17,7 @@ from wallmirror.derendering.likelihood import ROUGH, Fit, best_nonnegative, boun
 from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.nested import FINEST_QUADRATURE, Nested
 from wallmirror.derendering.problem import Problem
-from wallmirror.derendering.splines import SplineGrid, exposures
+from wallmirror.derendering.splines import SplineGrid, exposures, transport_of
 from wallmirror.derendering.subspace import ClosedForm, SignalSpace, banded_gram, closed_form
 from wallmirror.errors import UndeterminedError
 
@@ -258,7 +258,7 @@ class Ladder:
         prolongation = sp.csr_array(fine.in_halved() @ coarse.in_halved())
         r = closed.coefficients
         lost = r - prolongation @ _nearest(prolongation, r, closed.exposure)
-        films = np.stack([t @ lost for t in self.designs(index)], axis=1) @ closed.source
+        films = transport_of(self.designs(index), lost) @ closed.source
         return float(np.sum(self.problem.fit_weights * films**2))
 
     def foretold(self, index: int, detail: float) -> float:

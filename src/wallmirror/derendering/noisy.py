@@ -19,6 +19,7 @@ from wallmirror.derendering.knots import Refined, refine
 from wallmirror.derendering.nested import NOISY_STEPS
 from wallmirror.derendering.patterns import trusted_bound
 from wallmirror.derendering.problem import Problem, reduced_misfit
+from wallmirror.derendering.splines import transport_of
 from wallmirror.derendering.subspace import SignalSpace
 
 Array = NDArray[np.float64]
@@ -56,7 +57,7 @@ def solve_noisy(
     refined = refine(problem, space, steps, nonnegative=nonnegative, tolerance=tolerance, tell=tell)
     level, rival = refined.level, refined.rival
     grid, fit = level.grid, level.fit
-    transport = np.stack([t @ fit.coefficients for t in level.designs], axis=1)
+    transport = transport_of(level.designs, fit.coefficients)
     apart = level.groups.elements if len(level.groups) > 1 else ()
     stated = problem.noise_is_stated
     reduced = reduced_misfit(problem, transport, fit.source, level.parameters + fit.source.size)

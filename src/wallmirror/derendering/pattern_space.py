@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 
 #: Noise that would make no larger mismatch than this is rounding.
 ROUNDING = 1e-20
+#: Where nothing tells the noise, films with a smaller mismatch count as free of it: float64 renders end near 1e-24, float32
+#: files near 1e-13.
+NOISELESS = 1e-15
 # The finest knots of a BRDF into whose span noisy captures are projected, among those of the fit.
 _FINEST_SPAN = NOISY_STEPS.index(1.0)
 # Noise below this share of the films is none that a projection could be sure of taking away.

@@ -24,7 +24,7 @@ from wallmirror.derendering.knots import Level
 from wallmirror.derendering.likelihood import Fit
 from wallmirror.derendering.pattern_space import too_few_patterns
 from wallmirror.derendering.problem import Problem
-from wallmirror.derendering.splines import exposures
+from wallmirror.derendering.splines import exposures, transport_of
 from wallmirror.derendering.subspace import CERTAIN, LIKELY, POSSIBLE, noise_edge
 
 Array = NDArray[np.float64]
@@ -85,7 +85,7 @@ def trusted_bound(
         return bound, ()
     free = level.settled
     # Bounds weaken patterns, false ones and true ones. What noise makes of one is known without them alone.
-    films = np.stack([t @ free.coefficients for t in level.designs], axis=1)
+    films = transport_of(level.designs, free.coefficients)
     unbounded = np.linalg.svd(np.linalg.qr(problem.row_weights * films, mode="r") @ free.source, compute_uv=False)
     certain = max(certain, standing_out(unbounded / sigma, *size))
     possible = standing_out(unbounded / sigma, *size, units=POSSIBLE)

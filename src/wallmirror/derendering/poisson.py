@@ -21,7 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 from wallmirror.derendering.bounds import Bound, bound_of, require_order_one
 from wallmirror.derendering.convex import minimise_above, solve_positive
 from wallmirror.derendering.information import Information
-from wallmirror.derendering.poisson_information import Products, information_of_counts, seen_cells, transport_of
+from wallmirror.derendering.poisson_information import Products, information_of_counts, seen_cells
+from wallmirror.derendering.splines import transport_of
 from wallmirror.errors import InputError
 
 Array = NDArray[np.float64]

@@ -12,6 +12,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from wallmirror.derendering.information import unseen_pattern
+from wallmirror.derendering.splines import transport_of
 
 Array = NDArray[np.float64]
 
@@ -27,11 +28,6 @@ def seen_cells(designs: list[sp.csr_array]) -> NDArray[np.bool_]:
     for t in designs:
         energy += np.bincount(t.indices, weights=t.data**2, minlength=energy.size)
     return np.asarray(energy > _SEEN * energy.max())
-
-
-def transport_of(designs: list[sp.csr_array], r: Array) -> Array:
-    """F, shape (P, M)."""
-    return np.stack([t @ r for t in designs], axis=1)
 
 
 class Products:

@@ -16,7 +16,7 @@ from wallmirror.derendering.estimate import Estimate, doubts_of_fit
 from wallmirror.derendering.few_captures import STEPS, few_captures
 from wallmirror.derendering.likelihood import Fit, best_nonnegative, maximise, moments
 from wallmirror.derendering.problem import Problem, reduced_misfit, smoothness
-from wallmirror.derendering.splines import SplineGrid
+from wallmirror.derendering.splines import SplineGrid, transport_of
 from wallmirror.derendering.subspace import ClosedForm
 
 Array = NDArray[np.float64]
@@ -130,7 +130,7 @@ def _weighed(
     """The maximum of the likelihood next to r and V, with its bound and its doubts."""
     summed = moments(problem.data, designs, problem.inverse_variance)
     fit = maximise(summed, best_nonnegative(summed, start[1]), start[0], nonnegative=nonnegative)
-    transport = np.stack([t @ fit.coefficients for t in designs], axis=1)
+    transport = transport_of(designs, fit.coefficients)
     unknowns = int(np.count_nonzero(fit.coefficients)) + fit.source.size
     reduced = reduced_misfit(problem, transport, fit.source, unknowns)
     stated = problem.noise_is_stated

@@ -192,6 +192,11 @@ def design_matrices(kernel: Kernel, grid: SplineGrid) -> list[sp.csr_array]:
     return matrices
 
 
+def transport_of(designs: list[sp.csr_array], r: Array) -> Array:
+    """F = [T_1 r .. T_M r], shape (P, M)."""
+    return np.stack([t @ r for t in designs], axis=1)
+
+
 def exposures(designs: list[sp.csr_array], weights: Array) -> Array:
     """sum_p w_p T_i[p, k]^2 of each element and coefficient, shape (M, K), for w of shape (P,)."""
     squares = (sp.csr_array((t.data * t.data, t.indices, t.indptr), t.shape) for t in designs)

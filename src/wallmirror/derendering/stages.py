@@ -24,7 +24,7 @@ from wallmirror.derendering.nested import NOISY_STEPS
 from wallmirror.derendering.noisy import solve_noisy
 from wallmirror.derendering.one_bounce import check_one_bounce
 from wallmirror.derendering.options import Method
-from wallmirror.derendering.pattern_space import ROUNDING, expected_mismatch
+from wallmirror.derendering.pattern_space import NOISELESS, ROUNDING, expected_mismatch
 from wallmirror.derendering.preparing import prepare
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.rivals import hold_against_rivals
@@ -32,8 +32,6 @@ from wallmirror.derendering.scarce import refit_scarce, solve_scarce
 from wallmirror.derendering.subspace import SignalSpace
 from wallmirror.errors import UndeterminedError
 
-# Below this mismatch the data count as free of noise: float64 renders end near 1e-24, float32 files near 1e-13.
-_NOISELESS = 1e-15
 # Without noise the closed form is taken up to this error: a misfit that is no noise would give a likelihood false bars.
 _KNOWN = 0.1
 
@@ -162,7 +160,7 @@ class Asked:
         # The singular values beyond M tell noise best: knots as fine as the pixels fit noise as well. Where there are none
         # beyond, a mismatch near rounding has to do.
         noise = expected_mismatch(problem, space, exact.closed)
-        quiet = exact.closed.mismatch < _NOISELESS if math.isnan(noise) else noise < ROUNDING
+        quiet = exact.closed.mismatch < NOISELESS if math.isnan(noise) else noise < ROUNDING
         if exact.closed.near_solutions == 1 and (quiet or self.method == "closed_form"):
             check = partial(check_angle_sum_quietly, space=space)
             return Answer(*self._settled(problem, exact, fit, check, bounded=True), quiet)
@@ -176,7 +174,7 @@ class Asked:
         except UndeterminedError:
             if exact is None:
                 raise
-            return exact  # refused in the end, and the closed form knows the better reason
+            return exact  # with bars as wide as its bound, or refused for a better reason than the fit's
         if exact is not None and estimate.groups:
             return exact  # without noise it tells whether a scale each is all that is free
         return Answer(problem, estimate, quiet=exact is not None)
