@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -60,10 +61,11 @@ def climb(
     r, source = start.coefficients, start.source
     if r is None or source is None:
         r, source = ladder.closed(begin).coefficients, ladder.closed(begin).source
-    starts = [r]
+    first = None
     if nonnegative and ladder.space.rank == ladder.problem.card.elements:
-        starts.append(ladder.begun(begin, source).coefficients)
-    first = climber.fit(begin, *starts)
+        with suppress(UndeterminedError):  # where the bounds leave no light to tell the elements apart by
+            first = climber.fit(begin, r, ladder.begun(begin, source).coefficients)
+    first = climber.fit(begin, r) if first is None else first
     index, best, rival = climber.down(begin, first)
     if rival is not None:
         return {index: best}, rival

@@ -16,7 +16,7 @@ from wallmirror.derendering.one_bounce import OneBounceCheck
 from wallmirror.derendering.pattern_space import ROUNDING, expected_mismatch
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.solution import Solution
-from wallmirror.derendering.subspace import SignalSpace
+from wallmirror.derendering.subspace import ClosedForm, SignalSpace
 from wallmirror.errors import UndeterminedError
 
 Array = NDArray[np.float64]
@@ -82,6 +82,11 @@ def conclude(
         raise UndeterminedError(
             f"{closed.near_solutions} different BRDFs explain the captures equally well{tied}, gap {closed.gap:.1e}; use a "
             "card or views whose reflections share more angles"
+        )
+    if estimate.method == "closed_form" and faintest_missed(space, closed) > 1:
+        raise UndeterminedError(
+            "the closed form misses more of the captures than the faintest of their patterns is, so that this one may be made "
+            "of what is missed; use a card or views that tell the elements better apart"
         )
     expected = expected_mismatch(problem, space, closed)
     if len(groups) > 1 and estimate.method in FITS and not problem.noise_is_stated and expected < ROUNDING:
@@ -155,6 +160,15 @@ def conclude(
         angle_sum_check=angle_sum,
         seconds=seconds(),
     )
+
+
+def faintest_missed(space: SignalSpace, closed: ClosedForm) -> float:
+    """What a closed form misses of the films over the faintest of their patterns, both root mean squares.
+
+    Knots of all spacings may agree on a pattern that is made of what they all miss.
+    """
+    faintest = float(space.singular_values[closed.source.shape[0] - 1])
+    return math.sqrt(closed.mismatch) * float(np.linalg.norm(space.singular_values)) / max(faintest, 1e-300)
 
 
 def _status(problem: Problem, estimate: Estimate, warnings: list[str]) -> str:

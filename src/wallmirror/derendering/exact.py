@@ -55,9 +55,8 @@ class _Try:
 def solve_exactly(problem: Problem, space: SignalSpace, *, step_deg: float | None = None) -> Estimate:
     """Change the knots while that halves the error bound and rounding is not reached.
 
-    The error that is stated is the largest of four: the bound on r that mismatch and gap give, what rounding becomes
-    by the condition of F, how far the pattern moves on the next-best knots, and what is missed of the films beside the
-    faintest of their patterns, which could be made of it on all knots alike. Where no other knots have an answer
+    The error that is stated is the largest of three: the bound on r that mismatch and gap give, what rounding becomes
+    by the condition of F, and how far the pattern moves on the next-best knots. Where no other knots have an answer
     worth the name, the bound on r is multiplied by the condition instead. Where several BRDFs explain the captures because
     groups of elements share no angle, the answer is each group's up to a scale of its own (`separate`).
 
@@ -75,7 +74,7 @@ def solve_exactly(problem: Problem, space: SignalSpace, *, step_deg: float | Non
         if separated is not None:
             return _in_groups(problem, best, separated)
     condition = float(np.linalg.cond(closed.transport))
-    error = max(best.error, _ROUNDING * condition, faintest_missed(space, closed))
+    error = max(best.error, _ROUNDING * condition)
     rivals = [other for other in others if other.error < _WORTH_A_LOOK]
     if rivals:
         error = max(error, scale_free_error(closed.source, min(rivals, key=lambda other: other.error).closed.source))
@@ -109,13 +108,6 @@ def solve_exactly(problem: Problem, space: SignalSpace, *, step_deg: float | Non
         warnings=warnings,
         designs=designs,
     )
-
-
-def faintest_missed(space: SignalSpace, closed: ClosedForm) -> float:
-    """What the closed form misses of the films, over the faintest pattern in them, both root mean squares."""
-    elements = closed.source.shape[0]
-    faintest = float(space.singular_values[elements - 1])
-    return math.sqrt(closed.mismatch) * float(np.linalg.norm(space.singular_values)) / max(faintest, 1e-300)
 
 
 def _in_groups(problem: Problem, best: _Try, found: Separated) -> Estimate:
