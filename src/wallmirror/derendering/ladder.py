@@ -18,7 +18,7 @@ from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.nested import FINEST_QUADRATURE, Nested
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import SplineGrid, exposures, transport_of
-from wallmirror.derendering.subspace import ClosedForm, SignalSpace, banded_gram, closed_form
+from wallmirror.derendering.subspace import ClosedForm, SignalSpace, banded_gram, closed_form, stack_of
 from wallmirror.errors import UndeterminedError
 
 Array = NDArray[np.float64]
@@ -39,6 +39,7 @@ class Ladder:
     _smooth_bands: dict[int, Array] = field(default_factory=dict)
     _groups: dict[int, Groups] = field(default_factory=dict)
     _closed: dict[int, ClosedForm] = field(default_factory=dict)
+    _stacked: dict[int, Array] = field(default_factory=dict)
     _free: dict[int, Fit] = field(default_factory=dict)
     _begun: dict[int, Fit] = field(default_factory=dict)
     _bounded: dict[int, Fit] = field(default_factory=dict)
@@ -90,12 +91,15 @@ class Ladder:
                 made = closed_form_in_groups(problem.weighted_data, weighted, self.space, groups)
             else:
                 at_hand = self.nested.designed(index) if self.holds(index) else index
+                if at_hand not in self._stacked:
+                    self._stacked[at_hand] = stack_of(self.designs(at_hand), self.space, problem.row_weights)
                 made = closed_form(
                     problem.weighted_data,
                     self.designs(at_hand),
                     self.space,
                     row_weights=problem.row_weights,
                     band=self.band(index),
+                    stacked=self._stacked[at_hand],
                     prolongation=self.nested.prolongation(index, at_hand) if at_hand > index else None,
                 )
             self._closed[index] = made

@@ -33,13 +33,13 @@ Array = NDArray[np.float64]
 # Cells seen less than this relative to the best-seen one are weak: noise rules them in a start.
 _WEAK = 1e-4
 _RIDGE = 1e-12
-# Share of the misfit by which a full step may still lower it.
-_TOLERANCE = 1e-7
+# Share of the misfit by which a full step may still lower it, and where bounds make the last steps slow.
+_TOLERANCE, _BOUNDED = 1e-7, 5e-7
 #: The same between knots, where a fit need not be finer.
 ROUGH = 1e-5
-# What a full step may still gain of a datum's noise, however many data there are: a tenth where what is left hangs on
-# coefficients that the captures hardly see, as it turns the pattern by no more than a third of an error bar, and a fiftieth.
-_TENTH, _FIFTIETH = 0.1, 0.02
+# What a full step may still gain of a datum's noise, however many data there are: it turns the pattern by no more than a third
+# of an error bar, if all of it lies in one direction.
+_GAIN = 0.1
 # What holds coefficients back, of the information that would leave one as uncertain as the largest one is large: noise throws
 # those that the captures hardly see about, and with them all others off the maximum.
 _DAMPING = 0.1
@@ -174,13 +174,13 @@ def maximise(
 
 def finished(data: Moments, fit: Fit) -> Fit:
     """The maximum without bounds as far as the captures see it, from a fit that came near it."""
-    tolerance = min(ROUGH, _TENTH / max(1, data.observations))
+    tolerance = min(ROUGH, _GAIN / max(1, data.observations))
     return maximise(data, fit.coefficients, nonnegative=False, tolerance=tolerance, held=True, schur=fit.schur)
 
 
 def bounded(data: Moments, start: Array) -> Fit:
     """The maximum within the bounds, as near as error bars call for."""
-    return maximise(data, start, tolerance=min(_TOLERANCE, _FIFTIETH / max(1, data.observations)))
+    return maximise(data, start, tolerance=min(_BOUNDED, _GAIN / max(1, data.observations)))
 
 
 def best_nonnegative(data: Moments, source: Array, halved: sp.csr_array | None = None) -> Array:

@@ -136,6 +136,7 @@ def closed_form(
     *,
     row_weights: Array | None = None,
     band: Array | None = None,
+    stacked: Array | None = None,
     prolongation: sp.csr_array | None = None,
 ) -> ClosedForm:
     """Recover r, F and V from data whose rank is M: minimise sum_i |(I - U U^T) T_i r|^2.
@@ -152,18 +153,19 @@ def closed_form(
         Of shape (P, 1), where the data's rows are weighted and the designs' are not yet.
     band:
         `banded_gram(designs, row_weights)` where it is known already; that of the coarser knots with a prolongation.
+    stacked:
+        `stack_of(designs, space, row_weights)` where it is known already.
     prolongation:
         R of shape (K, K'), where r' on coarser knots is sought, R r' being r; K' takes the place of K in the result.
 
     Notes
     -----
-    With H = stack(U^T T_i) and A = sum T_i^T T_i the minimiser under sum |T_i r|^2 = 1 is r = A^-1 H^T q, where
+    With H = stack(U^T T_i) (`stack_of`) and A = sum T_i^T T_i the minimiser under sum |T_i r|^2 = 1 is r = A^-1 H^T q, where
     q is the leading eigenvector of H A^-1 H^T, whose eigenvalues lie in [0, 1].
     """
     u = space.basis
     weights = np.ones((u.shape[0], 1)) if row_weights is None else row_weights
-    weighted = weights * u
-    stacked = np.concatenate([(t.T @ weighted).T for t in designs])  # H, (M^2, K); rows i*M..i*M+M-1 belong to T_i
+    stacked = stack_of(designs, space, weights) if stacked is None else stacked
     stacked = stacked if prolongation is None else stacked @ prolongation
     size = stacked.shape[1]
     band = banded_gram(designs, row_weights) if band is None else band
@@ -199,6 +201,12 @@ def closed_form(
         family=family,
         beyond=float(lost[near]) if lost.size > near else 1.0,
     )
+
+
+def stack_of(designs: list[sp.csr_array], space: SignalSpace, row_weights: Array) -> Array:
+    """H = stack(U^T T_i), (M^2, K), of rows weighted first, (P, 1): rows i M .. i M + M - 1 belong to T_i."""
+    weighted = row_weights * space.basis
+    return np.concatenate([(t.T @ weighted).T for t in designs])
 
 
 def banded_gram(designs: list[sp.csr_array], row_weights: Array | None = None) -> Array:
