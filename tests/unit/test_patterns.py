@@ -57,7 +57,7 @@ def weakest(source: Array, seed: int, monkeypatch: pytest.MonkeyPatch, noise: fl
 
     def spy(problem: Any, level: Any, transport: Any, source: Array, *, sigma: float, bound: Any, bound_at: Any) -> Any:
         del transport, bound_at
-        told.append(free_coefficients(problem, level, level.free, source, sigma))
+        told.append(free_coefficients(problem, level, source))
         return bound, ()
 
     monkeypatch.setattr(noisy, "trusted_bound", spy)

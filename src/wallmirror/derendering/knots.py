@@ -20,7 +20,7 @@ from wallmirror.derendering.finer import worth
 from wallmirror.derendering.groups import Groups
 from wallmirror.derendering.information import Information, information
 from wallmirror.derendering.ladder import SPARE, Ladder
-from wallmirror.derendering.likelihood import ROUGH, Fit, finished, maximise
+from wallmirror.derendering.likelihood import Fit, finished
 from wallmirror.derendering.moments import Moments
 from wallmirror.derendering.pattern_space import expected_mismatch, too_few_patterns
 from wallmirror.derendering.problem import Problem
@@ -76,15 +76,6 @@ class Level:
     def peak_at(self) -> float:
         """Angle sum in radians at which the well-seen part of rho is largest."""
         return self.grid.peak(self.fit.coefficients, self.summed.exposure)
-
-    @cached_property
-    def settled(self) -> Fit:
-        """The free maximum itself, with whatever coefficients noise throws about."""
-        try:
-            r, schur = self.free.coefficients, self.free.schur
-            return maximise(self.summed, r, nonnegative=False, tolerance=ROUGH, schur=schur)
-        except UndeterminedError:
-            return self.free
 
     @cached_property
     def information(self) -> Information:

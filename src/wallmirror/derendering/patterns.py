@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from wallmirror.derendering.bounds import Bound
 from wallmirror.derendering.knots import Level
-from wallmirror.derendering.likelihood import Fit
 from wallmirror.derendering.pattern_space import too_few_patterns
 from wallmirror.derendering.problem import Problem
 from wallmirror.derendering.splines import exposures, transport_of
@@ -29,9 +28,10 @@ from wallmirror.derendering.subspace import CERTAIN, LIKELY, POSSIBLE, noise_edg
 
 Array = NDArray[np.float64]
 
-# Standard deviation of a coefficient that the other elements leave it, as a share of the largest that a fit without bounds has,
-# from which it is free: beside a false pattern, which is faint, coefficients of its own grow large.
-_FREE = 0.3
+# Standard deviation of a coefficient that the other elements leave it, as a share of that of the worst-known one, from which it
+# is free: beside a false pattern, which is faint, coefficients of its own grow large. And how well one must be seen to count as
+# the worst-known.
+_FREE, _SHOWN = 0.3, 1e-8
 _DOUBT = (
     "the faintest of the patterns is one that noise alone makes once in ten to a hundred times, so that one element fewer may "
     "be lit; the error bars do without it, and more light or more different patterns would tell"
@@ -72,21 +72,13 @@ def trusted_bound(
     triangle = np.linalg.qr(problem.row_weights * transport, mode="r")
     left, strength, right = np.linalg.svd(triangle @ source, full_matrices=False)
 
-    def certainly(free: Fit) -> tuple[int, tuple[int, int, int]]:
-        """How many patterns are, and the size of the noise that might have made others."""
-        size = (transport.shape[0], source.shape[1], free_coefficients(problem, level, free, source, sigma))
-        return standing_out(strength / sigma, *size), size
-
-    # Coefficients that the climb held are smaller than at the maximum itself, where fewer count as free.
-    certain, size = certainly(level.free)
-    if certain < elements:
-        certain, size = certainly(level.settled)
+    size = (transport.shape[0], source.shape[1], free_coefficients(problem, level, source))
+    certain = standing_out(strength / sigma, *size)
     if certain == elements:
         return bound, ()
-    free = level.settled
     # Bounds weaken patterns, false ones and true ones. What noise makes of one is known without them alone.
-    films = transport_of(level.designs, free.coefficients)
-    unbounded = np.linalg.svd(np.linalg.qr(problem.row_weights * films, mode="r") @ free.source, compute_uv=False)
+    films = transport_of(level.designs, level.free.coefficients)
+    unbounded = np.linalg.svd(np.linalg.qr(problem.row_weights * films, mode="r") @ level.free.source, compute_uv=False)
     certain = max(certain, standing_out(unbounded / sigma, *size))
     possible = standing_out(unbounded / sigma, *size, units=POSSIBLE)
     if possible < elements:
@@ -119,11 +111,12 @@ def standing_out(strength: Array, rows: int, realisations: int, free: int, units
     return int(below[0]) if below.size else elements
 
 
-def free_coefficients(problem: Problem, level: Level, free: Fit, source: Array, sigma: float) -> int:
+def free_coefficients(problem: Problem, level: Level, source: Array) -> int:
     """Most coefficients of rho that would be free, were one element dark: those that the others hardly show."""
-    pairs = level.summed.pairs
+    pairs, seen = level.summed.pairs, level.summed.seen
     alone = pairs[0].exposures if len(pairs) == 1 else exposures(level.designs, np.square(problem.row_weights[:, 0]))
     shown = alone * np.sum(source * source, axis=1)[:, None]
-    by_others = (np.sum(shown, axis=0) - shown)[:, level.summed.seen]
-    largest = float(np.max(np.abs(free.coefficients)))
-    return int(np.max(np.count_nonzero(by_others < (sigma / (_FREE * largest)) ** 2, axis=1)))
+    by_others = (np.sum(shown, axis=0) - shown)[:, seen]
+    variances = np.diag(level.bound.coefficients)
+    worst = float(np.max(variances, where=level.summed.exposure[seen] > _SHOWN, initial=0.0))
+    return int(np.max(np.count_nonzero(by_others * worst * _FREE**2 < 1, axis=1)))
