@@ -101,7 +101,10 @@ def missed_in_the_light(ladder: Ladder, finer: int, fit: Fit) -> Missed | None:
     finer, fit:
         Index of the finer knots, and the free fit on them.
     """
-    summed, halved, within = ladder.summed(finer), ladder.grids[finer - 1].in_halved(), ladder.bounded(finer, fit)
+    summed, halved = ladder.summed(finer), ladder.grids[finer - 1].in_halved()
+    if Lit.of(ladder, finer - 1, best_nonnegative(summed, fit.source, halved), finer) is None:
+        return None  # told before a fit within the bounds
+    within = ladder.bounded(finer, fit)
     coarse = best_nonnegative(summed, within.source, halved)
     lit = Lit.of(ladder, finer - 1, coarse, finer)
     if lit is None:
