@@ -44,7 +44,9 @@ def minimise_above(floor: Array, quadratic: Array, linear: Array) -> Array:
     for _ in range(_PIVOTS):
         x = np.zeros_like(floor)
         inside = np.flatnonzero(free)
-        if inside.size:
+        if inside.size == floor.size:
+            x = solve_positive(quadratic, offset)
+        elif inside.size:
             # Whole rows first: to pick entry by entry takes as long as to factorise.
             x[inside] = solve_positive(quadratic[inside][:, inside], offset[inside])
         wrong = np.where(free, x < -1e-12 * np.max(np.abs(x)), quadratic @ x - offset < -slack)
