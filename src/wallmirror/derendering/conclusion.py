@@ -83,11 +83,6 @@ def conclude(
             f"{closed.near_solutions} different BRDFs explain the captures equally well{tied}, gap {closed.gap:.1e}; use a "
             "card or views whose reflections share more angles"
         )
-    if estimate.method == "closed_form" and faintest_missed(space, closed) > 1:
-        raise UndeterminedError(
-            "the closed form misses more of the captures than the faintest of their patterns is, so that this one may be made "
-            "of what is missed; use a card or views that tell the elements better apart"
-        )
     expected = expected_mismatch(problem, space, closed)
     if len(groups) > 1 and estimate.method in FITS and not problem.noise_is_stated and expected < ROUNDING:
         raise UndeterminedError(
@@ -98,6 +93,11 @@ def conclude(
         raise UndeterminedError(
             f"the captures leave the pattern undetermined (its error bars come to {100 * estimate.predicted_error:.0f} "
             "% of it); capture more light, more views or more patterns"
+        )
+    if estimate.method == "closed_form" and faintest_missed(space, closed) > 1:
+        raise UndeterminedError(
+            "the closed form misses more of the captures than the faintest of their patterns is, so that this one may be made "
+            "of what is missed; use finer knots if they were given, or a card or views that tell the elements better apart"
         )
     peak = float(grid.evaluate(estimate.coefficients, estimate.peak_at))
     views, pixels, _ = problem.captures.radiance.shape

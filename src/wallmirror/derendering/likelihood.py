@@ -149,7 +149,7 @@ def maximise(
         before, quick = slope, False
         if curvature is not None and np.array_equal(pull.free, curvature.free):
             dr, slope = _step(data, state, pull, curvature)
-            if kept and slope <= _SURE * enough:
+            if kept and slope <= _SURE * tolerance * state.objective:
                 return _fit(state, iteration, converged=True)
             quick = _SURE * enough < slope <= _QUICK * before
         if not quick:
