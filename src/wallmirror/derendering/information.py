@@ -161,14 +161,32 @@ def schur_complement(
     return schur
 
 
+@dataclass(frozen=True)
+class Pull:
+    """The gradient of the objective at a point, turned round: in r (K,) and in V (B, M), of the entries of V that may move."""
+
+    r: Array
+    v: Array
+    free: NDArray[np.bool_]
+
+    def without_v(self, data: Moments, point: Point, inverse: Array) -> Array:
+        """That in r with V eliminated, shape (K,), for H_b^-1 as `inverses` gives them."""
+        return np.asarray(self.r - mixed(data, point, np.einsum("bij,bj->bi", inverse, self.v)))
+
+
+def pull_at(data: Moments, point: Point, *, nonnegative: bool) -> Pull:
+    """The gradient turned round; with bounds the entries of V at 0 that it would lead below may not move."""
+    v = point.moment - np.einsum("bij,bj->bi", point.normal[data.group], point.v)
+    r = np.einsum("bi,bik->k", point.v, data.cross) - mixed(data, point, point.v)
+    free = (point.v > 0) | (v > 0) if nonnegative else np.ones_like(point.v, dtype=bool)
+    return Pull(r, np.where(free, v, 0.0), free)
+
+
 def score_of(data: Moments, point: Point, cells: NDArray[np.intp]) -> tuple[Array, Array]:
-    """S on the given cells, and half the slope of the misfit there, with V >= 0 eliminated: shapes (n, n) and (n,)."""
-    pull_v = point.moment - np.einsum("bij,bj->bi", point.normal[data.group], point.v)
-    free = (point.v > 0) | (pull_v > 0)
-    inverse = inverses(data, point, free)
-    eliminated = np.einsum("bij,bj->bi", inverse, np.where(free, pull_v, 0.0))
-    pull_r = np.einsum("bi,bik->k", point.v, data.cross) - mixed(data, point, point.v) - mixed(data, point, eliminated)
-    return schur_complement(data, point, free, inverse, cells), pull_r[cells]
+    """S on the given cells, and the pull there, with V >= 0 eliminated: shapes (n, n) and (n,)."""
+    pull = pull_at(data, point, nonnegative=True)
+    inverse = inverses(data, point, pull.free)
+    return schur_complement(data, point, pull.free, inverse, cells), pull.without_v(data, point, inverse)[cells]
 
 
 def _coupling(data: Moments, point: Point) -> Array:

@@ -22,7 +22,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from wallmirror.derendering.convex import minimise_above, positive_factor
-from wallmirror.derendering.information import Point, inverses, mixed, point_at, schur_complement
+from wallmirror.derendering.information import Point, Pull, inverses, point_at, pull_at, schur_complement
 from wallmirror.derendering.moments import Moments, moments
 from wallmirror.errors import UndeterminedError
 
@@ -145,7 +145,8 @@ def maximise(
     slope, kept = 0.0, False
     for iteration in range(1, max_iterations + 1):
         enough = tolerance * state.objective + rounding
-        pull = _pull(data, state, nonnegative=nonnegative)
+        pull = pull_at(data, state, nonnegative=nonnegative)
+        # Near the maximum the curvature hardly changes: that of the point before does.
         before, quick = slope, False
         if curvature is not None and np.array_equal(pull.free, curvature.free):
             dr, slope = _step(data, state, pull, curvature)
@@ -218,31 +219,10 @@ def _fit(
     return Fit(state.r, state.v.T.copy(), state.objective, iterations, converged, schur)
 
 
-@dataclass(frozen=True)
-class _Pull:
-    """The gradient of the objective at a point, turned round: in r (K,) and in V (B, M), of the entries of V that may move."""
-
-    r: Array
-    v: Array
-    free: NDArray[np.bool_]
-
-
-def _pull(data: Moments, state: Point, *, nonnegative: bool) -> _Pull:
-    v = state.moment - np.einsum("bij,bj->bi", state.normal[data.group], state.v)
-    r = np.einsum("bi,bik->k", state.v, data.cross) - mixed(data, state, state.v)
-    free = (state.v > 0) | (v > 0) if nonnegative else np.ones_like(state.v, dtype=bool)
-    return _Pull(r, np.where(free, v, 0.0), free)
-
-
-def _step(data: Moments, state: Point, pull: _Pull, curvature: _Curvature) -> tuple[Array, float]:
-    """The Gauss-Newton step in r with V eliminated, and the decrease of the objective that it promises.
-
-    Near the maximum the curvature hardly changes: that of the point before does. Whether the climb is over, only the curvature
-    of the place itself may say.
-    """
+def _step(data: Moments, state: Point, pull: Pull, curvature: _Curvature) -> tuple[Array, float]:
+    """The Gauss-Newton step in r with V eliminated, and the decrease of the objective that it promises."""
     cells = np.flatnonzero(data.seen)
-    eliminated = np.einsum("bij,bj->bi", curvature.inverse, pull.v)
-    right = (pull.r - mixed(data, state, eliminated))[cells]
+    right = pull.without_v(data, state, curvature.inverse)[cells]
     dr = np.zeros_like(state.r)
     if curvature.factor is not None:
         dr[cells] = sl.cho_solve((curvature.factor, True), right, check_finite=False)

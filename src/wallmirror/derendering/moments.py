@@ -206,7 +206,7 @@ def moments(data: Array, designs: list[sp.csr_array], inverse_variance: Array | 
     windows = Windows.of(designs)
     if windows is not None:
         require_memory(
-            pairs_bytes(windows.most_entries(), weights.shape[1]),
+            pairs_bytes(windows.most_entries, weights.shape[1]),
             f"a fit of {len(designs)} elements on {designs[0].shape[1]} knots",
         )
     return Moments(

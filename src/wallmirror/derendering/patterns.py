@@ -71,7 +71,6 @@ def trusted_bound(
     elements = source.shape[0]
     triangle = np.linalg.qr(problem.row_weights * transport, mode="r")
     left, strength, right = np.linalg.svd(triangle @ source, full_matrices=False)
-
     size = (transport.shape[0], source.shape[1], free_coefficients(problem, level, source))
     certain = standing_out(strength / sigma, *size)
     if certain == elements:

@@ -8,6 +8,7 @@ it. Products of such blocks take matrices over the pixels to matrices over the c
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -80,6 +81,7 @@ class Windows:
         placed[self.slot] = films
         return placed.reshape(count, height, -1)
 
+    @cached_property
     def most_entries(self) -> int:
         """Entries that `grams` will find at most, without a look at a value: rows of N_ij reach as far as the windows of j do
         where those of i cover the row."""
@@ -114,7 +116,7 @@ class Windows:
         left = np.empty((count, height, width))
         products = np.empty(count * width * elements * width)
         places = np.empty(products.size, dtype=np.intp)
-        order, most = elements * (elements + 1) // 2 * self.size, self.most_entries()
+        order, most = elements * (elements + 1) // 2 * self.size, self.most_entries
         narrow = np.int32 if max(order, most) < np.iinfo(np.int32).max else np.int64
         columns, values, pointers = np.empty(most, narrow), np.empty(most), np.zeros(order + 1, narrow)
         rows = known = 0
